@@ -5,7 +5,7 @@ lattice point in ``updated``, the centre of the mass that it carries in ``total`
 
 A condition that holds particles either holds the nodes that carry them (in ``updated`` all nodes that they touch, in
 ``total`` those where they have more than a given share of the mass), or, in ``total``, points of the material alone
-(:mod:`~gaussian_swaying.mpm.point_holds`).
+(:mod:`~gaussian_swaying.mpm.pins`).
 """
 
 from __future__ import annotations
@@ -26,6 +26,9 @@ from gaussian_swaying.mpm.twins import Twinned
 
 BY_BODY = "by body"
 """The kind of a pin that becomes a hinge for a sheet, and a clamp for anything else."""
+
+FACE = "face"
+"""The kind of a clamp of a region: it holds points on its face, and the nodes behind."""
 
 CLOCK = 1e-9  # round-off of a time after many additions of a substep [s]
 _Kind = TypeVar("_Kind", bound="Boundary")
@@ -77,12 +80,15 @@ class Boundary(Recordable, Twinned, nn.Module, ABC):
     Attributes:
         needs_position: Whether :meth:`forward` uses the positions of nodes.
         needs_lattice: Whether it uses the positions of lattice points.
+        turn: Impulses (0) come before conditions that hold nodes, and rigid parts (2) after them, in whatever order
+            they are given.
         held_share: Share of a node's mass above which the particles of :meth:`particle_mask` hold it in ``total``; None
             if the condition acts on particles without holding nodes.
     """
 
     needs_position = False
     needs_lattice = False
+    turn = 1
     held_share: float | None = None
 
     def __init__(self, start: float = 0.0, end: float | None = None) -> None:
@@ -120,6 +126,11 @@ class Boundary(Recordable, Twinned, nn.Module, ABC):
         return self.start
 
     @property
+    def always(self) -> bool:
+        """True if it never begins and never ends."""
+        return self.holds_from <= 0 and self.end == math.inf
+
+    @property
     def moves(self) -> bool:
         """True if the held part moves, that is, if it has a :meth:`target` of its own."""
         return type(self).target is not Boundary.target
@@ -127,10 +138,6 @@ class Boundary(Recordable, Twinned, nn.Module, ABC):
     def target(self, place: Tensor, time: Tensor, dt: float | Tensor) -> Tensor:
         """Velocity of what it holds at some places now (..., 3) [m/s], for a substep of ``dt`` [s]; zero if at rest."""
         return torch.zeros_like(place)
-
-    def turning(self, arm: Tensor, dt: float | Tensor) -> Tensor:
-        """Return the difference of the target velocity [m/s] over a distance ``arm`` (..., 3) [m]; zero if at rest."""
-        return torch.zeros_like(arm)
 
     def particle_mask(self, rest_position: Tensor) -> Tensor | None:
         """Particles that the condition holds, from their rest positions (..., P, 3); None if it holds none."""
@@ -153,14 +160,6 @@ class Boundary(Recordable, Twinned, nn.Module, ABC):
             velocity: Node velocity after the momentum update [m/s], shape (..., G, 3).
             nodes: Other data about them.
         """
-
-
-def refuse_points(boundary: Boundary, what: str, instead: str) -> ValueError:
-    """The error for a boundary that holds points where only nodes can be held."""
-    return ValueError(
-        f"{what} of the {type(boundary).__name__} needs particles that keep their neighbours, which the updated "
-        f"formulation does not have: set {instead}, or `solver.formulation` to total."
-    )
 
 
 class ParticleBoundary(Boundary):

@@ -16,12 +16,11 @@ from gaussian_swaying._checks import check_positive
 from gaussian_swaying._fixed import fixed
 from gaussian_swaying.geometry.groups import joined
 from gaussian_swaying.geometry.linalg import largest_eigenvalue
-from gaussian_swaying.mpm.boundary import CLOCK, Boundary, Nodes
+from gaussian_swaying.mpm.boundary import CLOCK, FACE, Boundary, Nodes
 from gaussian_swaying.mpm.colliders import Obstacle
 from gaussian_swaying.mpm.contact import Surface
 from gaussian_swaying.mpm.damping import damped_substep
 from gaussian_swaying.mpm.dispatch import LawDispatch
-from gaussian_swaying.mpm.pins import Impulse, PinnedRegion, RigidRegion
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, bounding_grid
 from gaussian_swaying.mpm.timestep import MAX_CFL, cfl_number, stable_limit, wave_speed
 from gaussian_swaying.mpm.transfer import Stencil, scatter
@@ -99,9 +98,9 @@ class Formulation(ABC):
         laws: The laws of the material, bound to its particles.
         held: The particles that each boundary holds; None for one that holds none.
         rigid: The places among the boundaries of those that make a part rigid.
-        kinds: Kind of each boundary: ``nodes``, points as ``hinge`` or ``clamp``, or ``surface``
+        kinds: Kind of each boundary: ``nodes``, points as ``hinge``, ``clamp`` or ``face``, or ``surface``
             (``Boundary.hold_kind``).
-        on_nodes: Whether each boundary acts on nodes, by its ``forward``; a clamp may do so besides its points.
+        on_nodes: Whether each boundary acts on nodes, by its ``forward``; a face does so besides its points.
         needs_position: Whether a boundary uses the positions of nodes.
         needs_lattice: Whether a boundary uses the positions of lattice points.
     """
@@ -117,9 +116,9 @@ class Formulation(ABC):
         self.points, self.boundaries, self.settings, self.surface = points, tuple(boundaries), settings, surface
         self.laws = LawDispatch(points)
         self.held = tuple(_held(points, boundary) for boundary in self.boundaries)
-        self.rigid = [k for k, boundary in enumerate(self.boundaries) if isinstance(boundary, RigidRegion)]
+        self.rigid = [k for k, boundary in enumerate(self.boundaries) if boundary.turn == 2]
         self.kinds = tuple(self.hold_kind(k) for k in range(len(self.boundaries)))
-        self.on_nodes = tuple(self.acts_on_nodes(k) for k in range(len(self.boundaries)))
+        self.on_nodes = tuple(kind in ("nodes", FACE) for kind in self.kinds)
         nodal = [b for b, acts in zip(self.boundaries, self.on_nodes, strict=True) if acts]
         self.needs_position = any(b.needs_position for b in nodal)
         self.needs_lattice = any(b.needs_lattice for b in nodal)
@@ -158,10 +157,6 @@ class Formulation(ABC):
     def hold_kind(self, k: int) -> str:
         """Return what the ``k``-th boundary acts on, see ``Boundary.hold_kind``."""
         return self.boundaries[k].hold_kind(self.neighbours_fixed)
-
-    def acts_on_nodes(self, k: int) -> bool:
-        """True if the ``k``-th boundary acts on nodes."""
-        return self.kinds[k] == "nodes"
 
     # ---- state and grid
 
@@ -279,8 +274,7 @@ class Formulation(ABC):
         """
         taken, fixed = list(self.no_impulse().unbind(-2)), None
         acting = [k for k, acts in enumerate(self.on_nodes) if acts]
-        # impulses come before conditions that hold nodes, and rigid parts after them, in whatever order they are given
-        for k in sorted(acting, key=lambda k: _turn(self.boundaries[k])):
+        for k in sorted(acting, key=lambda k: self.boundaries[k].turn):
             boundary, held, before = self.boundaries[k], self.held[k], velocity
             if held is None:
                 nodes = Nodes(time, dt, position, lattice)
@@ -289,7 +283,7 @@ class Formulation(ABC):
                 known = held.threshold, held.total, mass, fixed, held.nodes
                 nodes = Nodes(time, dt, position, lattice, share, *known)
             velocity = boundary(velocity, nodes)
-            if self.rigid and isinstance(boundary, PinnedRegion):
+            if self.rigid and held is not None and boundary.turn == 1:
                 pinned = nodes.held & boundary.active(time)
                 fixed = pinned if fixed is None else fixed | pinned
             with torch.no_grad():
@@ -393,10 +387,6 @@ def _held(points: MaterialPoints, boundary: Boundary) -> Held | None:
         return None
     mass = torch.where(mask, points.mass, 0.0)
     return Held(mass, mass.sum(-1), boundary.release_time(position))
-
-
-def _turn(boundary: Boundary) -> int:
-    return 0 if isinstance(boundary, Impulse) else 2 if isinstance(boundary, RigidRegion) else 1
 
 
 def held_share(held: Held, stencil: Stencil, inverse_mass: Tensor, time: Tensor) -> Tensor:

@@ -215,11 +215,10 @@ class Structure:
             share = held.share.reshape(-1, self.nodes)[scene].detach().cpu().numpy()
             pinned[share > held.threshold] = k
         rows = []
-        holds = total.point_holds
-        if holds is not None:
-            node = holds.node[0, scene].cpu().numpy() - scene * self.nodes
-            weight, owner = holds.weight[0, scene].detach().double().cpu().numpy(), holds.owner[0, scene].cpu().numpy()
-            slope, release = holds.slope[0, scene].cpu().numpy(), holds.release[0, scene].cpu().numpy()
+        if total.pinned is not None:
+            fields = (field[0, scene].detach().cpu().numpy() for field in total.pinned.rows)
+            node, weight, _, slope, owner, release = fields
+            node = node - scene * self.nodes
             for k in range(len(total.kinds)):
                 for is_slope in (False, True):
                     some = np.flatnonzero((owner == k) & (slope == is_slope) & (release > 0))
@@ -499,9 +498,9 @@ def _content(total: Total, scene: int, most: int) -> str:
     for held in total.held:
         if held is not None:
             add(held.mass.reshape(-1, count)[scene] > 0, held.threshold)
-    holds = total.point_holds
-    if holds is not None:
-        add(holds.node[0, scene], holds.weight[0, scene].float(), holds.owner[0, scene])
+    if total.pinned is not None:
+        rows = total.pinned.rows
+        add(rows.node[0, scene], rows.weight[0, scene].float(), rows.owner[0, scene])
     return digest.hexdigest()[:32]
 
 

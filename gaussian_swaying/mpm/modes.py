@@ -436,8 +436,7 @@ def why_not_modes(points: MaterialPoints, boundaries: Sequence[Boundary], surfac
 
 def _holds_still(boundary: Boundary) -> bool:
     still = type(boundary).forward is PinnedRegion.forward or isinstance(boundary, PinnedPoints)
-    always = boundary.holds_from <= 0 and boundary.end == math.inf
-    return still and always and not boundary.moves and boundary.release_time(torch.zeros(1, 3)) is None
+    return still and boundary.always and not boundary.moves and boundary.release_time(torch.zeros(1, 3)) is None
 
 
 def warped(turn: Tensor, shift: Tensor) -> Tensor:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,17 +12,13 @@ from torch import Tensor
 
 from gaussian_swaying._devices import in_double
 from gaussian_swaying.geometry.linalg import polar_rotation
-from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.geometry.rigid import centre, fitted_gradient
-from gaussian_swaying.mpm.boundary import BY_BODY, Boundary
+from gaussian_swaying.mpm.boundary import FACE, Boundary
 from gaussian_swaying.mpm.contact import ContactStage, Surface
 from gaussian_swaying.mpm.damping import kelvin_voigt_pk1
 from gaussian_swaying.mpm.dispatch import LawDispatch
 from gaussian_swaying.mpm.formulation import Formulation, Held, Settings, flowing, held_share, safe_inverse
-from gaussian_swaying.mpm.held_faces import HELD_ALONE, SHEET, SOFTENED, thickness, width
-from gaussian_swaying.mpm.held_rows import LEAST_APART
-from gaussian_swaying.mpm.pins import PinnedPoints
-from gaussian_swaying.mpm.point_holds import POINTS, PointHolds
+from gaussian_swaying.mpm.pins import PINNED_ALONE, POINTS, SOFTENED, PinnedRows, kind_in_total
 from gaussian_swaying.mpm.sheets import bending_of, director_energy, in_plane_stress, stress_of_sheets
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState
 from gaussian_swaying.mpm.timestep import kick_time
@@ -102,7 +97,7 @@ class Total(Formulation):
             assert points.normal is not None
             self.normal = torch.where((points.bending.detach() > 0)[..., None], points.normal, 0.0)
             self.bending_rate = self.bending.fastest(self.node_inverse_mass)
-        self.point_holds = self._hold_points()
+        self.pinned = self._pinned_rows()
         self.contact = self._contact()
 
     def _summed(self, values: Tensor) -> Tensor:
@@ -128,112 +123,17 @@ class Total(Formulation):
         return every.reshape(*self.points.mass.shape[:-1], *every.shape[1:])
 
     def hold_kind(self, k: int) -> str:
-        """Return what a boundary acts on; a pin without a kind holds a sheet by a hinge, and anything else by a clamp.
-
-        Next to a rigid part it holds nodes, as points cannot share nodes with one. Warns if a hinge or a clamped place
-        is to hold a part of several cells in thickness, which it cannot, and if a hinge is wider than a line of points.
-        """
-        boundary, kind = self.boundaries[k], super().hold_kind(k)
-        given = isinstance(boundary, PinnedPoints)
-        if kind == BY_BODY and self._next_to_rigid(k):
-            return "nodes"
-        if kind == BY_BODY or (kind == "hinge" and not given) or (kind == "clamp" and given):
-            thick, sheet = self._thickness(k)
-            if kind == BY_BODY:
-                held = self.held[k]
-                return "hinge" if sheet or (held is not None and held.release is not None) else "clamp"
-            if thick > SHEET * self.settings.dx:
-                remedy = "use a PinnedRegion" if given else "set `kind` to clamp, or to null"
-                warnings.warn(
-                    f"`kind: {kind}` of the {type(boundary).__name__} is to hold a part that is "
-                    f"{thick / self.settings.dx:.2g} cells thick, which still turns: {remedy}.",
-                    UserWarning,
-                    stacklevel=2,
-                )
-            elif kind == "hinge" and (wide := self._held_width(k)) > 2 * LEAST_APART * self.settings.dx:
-                warnings.warn(
-                    f"The region of the {type(boundary).__name__} with `kind: hinge` is "
-                    f"{wide / self.settings.dx:.2g} cells wide, so it holds several lines and with them the slope: "
-                    "make it narrower than a cell (`solver.dx`), or set `kind` to clamp to hold the slope.",
-                    UserWarning,
-                    stacklevel=2,
-                )
-        return kind
-
-    def _next_to_rigid(self, k: int) -> bool:
-        """True if a boundary holds particles that may share nodes with a rigid part."""
-        held = self.held[k]
-        if held is None or not self.rigid:
-            return False
-        from scipy.spatial import cKDTree
-
-        count = held.mass.shape[-1]
-        place, own, rigid = (
-            field.detach().reshape(-1, count, *field.shape[held.mass.ndim :]).cpu()
-            for field in (self.points.position, held.mass > 0, self.is_rigid())
-        )
-        reach = 3 * self.settings.dx
-        for where, pinned, part in zip(place.double(), own, rigid, strict=True):
-            near = cKDTree(where[part].numpy()).query(where[pinned].numpy(), p=math.inf, distance_upper_bound=reach)[0]
-            if len(near) and float(near.min()) < reach:
-                return True
-        return False
-
-    def _held_width(self, k: int) -> float:
-        """The width of the line or patch that a boundary holds [m], the largest of all scenes."""
-        points, held = self.points, self.held[k]
-        assert held is not None
-        count, found = points.position.shape[-2], [0.0]
-        fields = points.position.detach().reshape(-1, count, 3), held.mass.detach().reshape(-1, count)
-        for place, weight in zip(*(field.cpu().double() for field in fields), strict=True):
-            own = weight > 0
-            if bool(own.any()):
-                found.append(width(place[own], weight[own], self.settings.dx))
-        return max(found)
-
-    def _thickness(self, k: int) -> tuple[float, bool]:
-        """The largest thickness of the body where a boundary holds it [m], and whether all scenes are sheets there."""
-        points, held = self.points, self.held[k]
-        count = points.position.shape[-2]
-        position, mass = (
-            points.position.detach().reshape(-1, count, 3).cpu(),
-            points.mass.detach().reshape(-1, count).cpu(),
-        )
-        found = []
-        for s, (place, weight) in enumerate(zip(position, mass, strict=True)):
-            for own in self.pieces:
-                if held is None:
-                    pins = self.boundaries[k]
-                    assert isinstance(pins, PinnedPoints)
-                    where = pins.at.detach().cpu().to(place)
-                    if own is not None:
-                        nearest = nearest_neighbours(place.double(), 1, where.double())[1][:, 0]
-                        where = where[torch.isin(nearest, own)]
-                else:
-                    mine = held.mass.detach().reshape(-1, count)[s].cpu() > 0
-                    where = place[mine] if own is None else place[own][mine[own]]
-                whole = (place, weight) if own is None else (place[own], weight[own])
-                found.append(thickness(*whole, where, self.settings.dx))
-        return max(thick for thick, _ in found), all(sheet for _, sheet in found)
-
-    def acts_on_nodes(self, k: int) -> bool:
-        """True if a boundary acts on nodes; so does a clamp, on nodes that carry only held material."""
-        return super().acts_on_nodes(k) or self.has_face(k)
-
-    def has_face(self, k: int) -> bool:
-        """True if a boundary clamps a region and never releases its particles one by one."""
-        held = self.held[k]
-        return self.kinds[k] == "clamp" and held is not None and held.release is None
+        return kind_in_total(self, k)
 
     def _soften(self) -> Tensor | None:
-        """Reduce the stiffness of material that clamps hold all the time; return the factors (``held_faces.SOFTENED``).
+        """Reduce the stiffness of material that clamps hold all the time; return the factors (``pins.SOFTENED``).
 
         None if there is none.
         """
         masks = [
             held.mass > 0
-            for k, (held, boundary) in enumerate(zip(self.held, self.boundaries, strict=True))
-            if held is not None and self.has_face(k) and _always(boundary)
+            for kind, held, boundary in zip(self.kinds, self.held, self.boundaries, strict=True)
+            if kind == FACE and held is not None and boundary.always
         ]
         if not masks:
             return None
@@ -242,25 +142,16 @@ class Total(Formulation):
         self.laws = LawDispatch(replace(self.points, youngs_modulus=torch.where(own, SOFTENED * E, E)))
         return torch.where(own, SOFTENED, 1.0)
 
-    def _hold_points(self) -> PointHolds | None:
+    def _pinned_rows(self) -> PinnedRows | None:
         if not any(kind in POINTS for kind in self.kinds):
             return None
-        faces = [k for k in range(len(self.kinds)) if self.has_face(k)]
-        still = torch.zeros_like(self.node_mass, dtype=torch.bool)
-        for k in faces:
-            held = self.held[k]
-            assert held is not None
-            assert held.share is not None
-            still |= held.share > held.threshold
-        holds = PointHolds(self, self.kinds, faces, still, self.stencil, self.grid, self.node_inverse_mass)
-        if not holds.rows:
-            return None  # a clamp that holds everything has no face
-        if any(bool((body.mass.reshape(-1)[holds.affected] > 0).any()) for body in self.rigid_bodies):
-            raise ValueError(
-                "A pin holds points of a rigid part or next to it, which it cannot: set its `kind` to nodes, which "
-                "holds the whole part, or leave three cells of soft material between."
-            )
-        return holds
+        still, rigid = torch.zeros_like(self.node_mass, dtype=torch.bool), [body.mass > 0 for body in self.rigid_bodies]
+        for kind, held in zip(self.kinds, self.held, strict=True):
+            if kind == FACE and held is not None and held.share is not None:
+                still = still | (held.share > held.threshold)
+        among = torch.stack(rigid).any(0) if rigid else torch.zeros_like(still)
+        rows = PinnedRows(self, still, among, self.stencil, self.grid, self.node_inverse_mass)
+        return rows if rows.C.numel() else None  # a clamp that holds everything has no face
 
     def _body(self, k: int) -> _RigidNodes:
         held = self.held[k]
@@ -293,9 +184,9 @@ class Total(Formulation):
 
     def _on_nodes(self, k: int, held: Held) -> Held:
         """Return the particles that the ``k``-th boundary holds, with their constant share of the mass of each node."""
-        boundary, face = self.boundaries[k], self.has_face(k)
+        boundary, face = self.boundaries[k], self.kinds[k] == FACE
         share = self._summed(held.mass[..., None])[..., 0] * self.node_inverse_mass
-        threshold = HELD_ALONE if face else boundary.held_share
+        threshold = PINNED_ALONE if face else boundary.held_share
         if threshold is not None and not face and not bool((share > threshold).any()):
             count = int((held.mass > 0).sum())
             raise ValueError(
@@ -400,9 +291,8 @@ class Total(Formulation):
     ) -> tuple[Tensor, Tensor]:
         """Apply all boundary conditions: see :meth:`constrain`; points are held last, and exactly."""
         velocity, taken = self.constrain(velocity, self.node_mass, self.share_at(time), position, lattice, time, dt)
-        holds = self.point_holds
-        if holds is not None:
-            velocity, more = holds.hold(velocity, displacement, time, dt)
+        if self.pinned is not None:
+            velocity, more = self.pinned.hold(velocity, displacement, time, dt)
             taken = taken + more.reshape(taken.shape)
         return velocity, taken
 
@@ -456,10 +346,6 @@ class Total(Formulation):
         momentum = self.node_mass[..., None] * velocity
         place = self.node_positions(momentum) + displacement
         return momentum.sum(-2), torch.linalg.cross(place, momentum, dim=-1).sum(-2)
-
-
-def _always(boundary: Boundary) -> bool:
-    return boundary.holds_from <= 0 and boundary.end == math.inf
 
 
 def _region(boundary: Boundary) -> object:

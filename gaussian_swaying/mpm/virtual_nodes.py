@@ -68,16 +68,16 @@ def _of_one_scene(first: Tensor, grid: GridSpec, attached: Tensor) -> tuple[Tens
     else:
         a, b = first[attached].unbind(1)
         fragment = joined(len(first), attached[a == b].T)  # connected within a cell: such points have the same nodes
-    example = _first_of(fragment)
+    example = first_of(fragment)
     cell = first[example]
     node = (cell[:, None] + shifts(grid)).reshape(-1)
     if attached.dim() == 1:
         component = equal_rows(torch.stack([node, attached[example].repeat_interleave(27)], 1))
     else:
         component = joined(len(node), _common(cell, once(fragment[attached[a != b]], len(cell)), grid))
-    leader = _first_of(component).sort().values  # in the order of the points, whatever the graph says
+    leader = first_of(component).sort().values  # in the order of the points, whatever the graph says
     of = node[leader]
-    copy = _first_of(torch.unique(of, return_inverse=True)[1])
+    copy = first_of(torch.unique(of, return_inverse=True)[1])
     copy = torch.ones(len(of), dtype=torch.bool).index_fill_(0, copy, False)
     number = torch.where(copy, grid.lattice_count + copy.cumsum(0) - 1, of)
     named = torch.zeros(len(leader), dtype=torch.long).index_put_((component[leader],), number)
@@ -95,7 +95,7 @@ def _common(cell: Tensor, pairs: Tensor, grid: GridSpec) -> Tensor:
     return torch.stack([27 * pairs[pair, 0] + place, 27 * pairs[pair, 1] + other])
 
 
-def _first_of(group: Tensor) -> Tensor:
+def first_of(group: Tensor) -> Tensor:
     """The first member of each group; groups are numbered from 0."""
     many = int(group.max()) + 1 if len(group) else 0
     none = torch.full((many,), len(group))
@@ -134,7 +134,7 @@ def point_with_nodes(first: Tensor, near: Tensor, point_first: Tensor, point_nod
         The point whose nodes each place has, shape (M,); -1 where there is none.
     """
     units = equal_rows(torch.cat([point_first[:, None], point_node.T], 1))
-    example = _first_of(units)
+    example = first_of(units)
     example = example[point_first[example].argsort(stable=True)]
     cells = point_first[example].contiguous()
     found = torch.where(first == point_first[near], near, -1)

@@ -10,9 +10,7 @@ from torch.testing import assert_close
 
 from gaussian_swaying import Box, MPMSolver, PinnedPoints, PinnedRegion
 from gaussian_swaying.geometry.regions import Everything
-from gaussian_swaying.mpm.held_faces import SOFTENED, along_face, face, thickness
-from gaussian_swaying.mpm.held_rows import MOST_ROWS
-from gaussian_swaying.mpm.pins import Handle
+from gaussian_swaying.mpm.pins import MOST_ROWS, SOFTENED, Handle, along_face, face, thickness
 
 DX = 0.1
 
@@ -66,7 +64,7 @@ def test_a_large_face_takes_larger_patches():
     rest = _box(2, 60, 60, step=0.5)
     solver = MPMSolver(DX, boundaries=[PinnedRegion(Chosen(rest[:, 0] < DX), "clamp")], gravity=(0, 0, 0))
     solver.init_state(_material(rest))
-    assert 100 < solver.bound.point_holds.rows <= MOST_ROWS
+    assert 100 < solver.bound.pinned.W.shape[-1] <= MOST_ROWS
 
 
 # ---- sheet or solid
@@ -100,7 +98,7 @@ def test_the_default_holds_a_sheet_by_a_hinge_and_a_solid_by_a_clamp():
         solver = MPMSolver(DX, boundaries=[PinnedRegion(Box([None] * 3, [0.07, None, None])), Handle(Everything())])
         solver.init_state(_material(rest))
         kinds[name] = solver.bound.kinds[0]
-    assert kinds == {"sheet": "hinge", "solid": "clamp", "cord": "clamp"}
+    assert kinds == {"sheet": "hinge", "solid": "face", "cord": "face"}
 
 
 def test_what_cannot_hold_is_warned_of_at_the_start():
@@ -121,7 +119,7 @@ def test_a_hinge_that_holds_several_lines_is_warned_of(rows, wide, shift):
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         solver.init_state(_material(rest))
-    holds = solver.bound.point_holds
+    holds = solver.bound.pinned.rows
     along = holds.place[0, 0][~holds.slope[0, 0]][:, 0].sort()[0]
     assert (float(along[-1] - along[0]) > 0.3 * DX) == wide
     said = [str(one.message) for one in told if "holds several lines and with them the slope" in str(one.message)]

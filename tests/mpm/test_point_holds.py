@@ -20,7 +20,7 @@ from gaussian_swaying import (
 )
 from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.geometry.regions import Everything
-from gaussian_swaying.mpm import held_rows, point_holds
+from gaussian_swaying.mpm import pins as pinning
 from gaussian_swaying.mpm.colliders import BallObstacle, Plane
 from gaussian_swaying.mpm.pins import Handle, SequentialRelease
 from gaussian_swaying.mpm.state import GridSpec
@@ -66,8 +66,8 @@ def _push(points, size=0.02):
 
 def _own_places(holds, phase=0, scene=0):
     """The values among the rows."""
-    own = ~holds.slope[phase, scene]
-    return holds.place[phase, scene][own]
+    own = ~holds.rows.slope[phase, scene]
+    return holds.rows.place[phase, scene][own]
 
 
 # ---- what is held
@@ -86,7 +86,7 @@ def test_held_points_stay_where_they_are(kind, dtype, most, layers):
     for pin, across in ((PinnedRegion(TOP, kind), 1), *([] if layers == 3 else [(PinnedPoints(AT, kind), slice(3))])):
         solver = MPMSolver(DX, boundaries=[pin])
         state = _run(solver, points, 200, force=_push(points), every=200)[-1]
-        rows = _own_places(solver.bound.point_holds) if across == 1 else AT
+        rows = _own_places(solver.bound.pinned) if across == 1 else AT
         moved = _read(solver, rows, state.node_displacement, state)
         assert float(state.node_displacement.abs().max()) > 0.02
         assert len(rows) >= 3
@@ -110,7 +110,7 @@ def _thick(turn):
     place = points.position * torch.tensor([1.0, 5.2, 1.0], dtype=torch.float64)
     points = dataclasses.replace(points, position=place, mass=share * points.mass, volume=share * points.volume)
     top = place[:, 2] - math.tan(turn) * place[:, 0] > -0.6 * STEP / math.cos(turn)
-    return points, top, (0.0, 1.0, 0.0, 0.0), (7, 20 * STEP / held_rows.LEAST_APART / DX + 1)
+    return points, top, (0.0, 1.0, 0.0, 0.0), (7, 20 * STEP / pinning.LEAST_APART / DX + 1)
 
 
 def _across(yaw):
@@ -132,7 +132,7 @@ def test_a_hinge_is_a_line_in_the_middle_plane(make, number):
     points, top, (a, b, c, d), (least, most) = make(number)
     solver = MPMSolver(DX, gravity=(0, 0, 0), boundaries=[PinnedRegion(Chosen(top), "hinge")])
     solver.init_state(points)
-    rows = solver.bound.point_holds.place.reshape(-1, 3)
+    rows = solver.bound.pinned.rows.place.reshape(-1, 3)
     assert float((rows @ torch.tensor([a, b, c], dtype=torch.float64) - d).abs().max()) < 1e-9
     if make is _strip:
         assert_close(rows[:, 2], torch.full_like(rows[:, 2], number - STEP), rtol=0, atol=1e-12)
@@ -143,12 +143,12 @@ def test_groups_are_joined_until_they_are_apart():
     place = torch.tensor([0.0, 0.1, 0.32, 0.9, 1.0, 2.0], dtype=torch.float64)
     position = torch.nn.functional.pad(place[:, None], (0, 2))
     mass, cell = torch.ones(6, dtype=torch.float64), torch.tensor([7, 7, 8, 9, 9, 12])
-    assert held_rows.groups(position, mass, cell, 0.2).tolist() == [0, 0, 1, 2, 2, 3]
-    assert held_rows.groups(position, mass, cell, 0.3).tolist() == [0, 0, 0, 1, 1, 2]
-    assert held_rows.groups(position, mass, cell, 0.9).tolist() == [0, 0, 0, 0, 0, 1]
-    assert held_rows.groups(position[:0], mass[:0], cell[:0], 0.3).tolist() == []
+    assert pinning.groups(position, mass, cell, 0.2).tolist() == [0, 0, 1, 2, 2, 3]
+    assert pinning.groups(position, mass, cell, 0.3).tolist() == [0, 0, 0, 1, 1, 2]
+    assert pinning.groups(position, mass, cell, 0.9).tolist() == [0, 0, 0, 0, 0, 1]
+    assert pinning.groups(position[:0], mass[:0], cell[:0], 0.3).tolist() == []
     heavy = torch.tensor([1.0, 1, 1, 1, 3, 1], dtype=torch.float64)
-    found = held_rows.means(position, heavy, torch.tensor([0, 0, 0, 1, 1, 2]))
+    found = pinning.means(position, heavy, torch.tensor([0, 0, 0, 1, 1, 2]))
     assert_close(found[:, 0], torch.tensor([0.14, 0.975, 2.0], dtype=torch.float64))
 
 
@@ -158,12 +158,14 @@ def test_a_place_just_outside_extends_the_nearest_cell(shift):
     points = _sheet(shift=(0.0, 0.0, shift * DX))
     solver = MPMSolver(DX, boundaries=[PinnedPoints([[0.2, 0.0, shift * DX]])])
     state = solver.init_state(points)
-    holds = solver.bound.point_holds
+    holds = solver.bound.pinned
     field = state.grid.node_positions(state.position)
     massive = solver.bound.node_mass > 0
-    seen = (holds.weight[0, 0, 0, :, None] * torch.where(massive[:, None], field, 1e6)[holds.node[0, 0, 0]]).sum(0)
-    used = holds.weight[0, 0, 0] != 0
-    assert bool(massive[holds.node[0, 0, 0][used]].all())
+    seen = (
+        holds.rows.weight[0, 0, 0, :, None] * torch.where(massive[:, None], field, 1e6)[holds.rows.node[0, 0, 0]]
+    ).sum(0)
+    used = holds.rows.weight[0, 0, 0] != 0
+    assert bool(massive[holds.rows.node[0, 0, 0][used]].all())
     assert_close(seen, torch.tensor([0.2, 0.0, shift * DX], dtype=torch.float64), rtol=0, atol=1e-13)
 
 
@@ -175,7 +177,7 @@ def test_places_are_converted_from_scene_units():
     solver = MPMSolver(DX, boundaries=[PinnedPoints(at)])
     solver.init_state(points, frame=frame)
     expected = frame.point_to_sim(torch.tensor(at, dtype=torch.float64))
-    assert_close(_own_places(solver.bound.point_holds), expected, rtol=0, atol=1e-13)
+    assert_close(_own_places(solver.bound.pinned), expected, rtol=0, atol=1e-13)
 
 
 # ---- which rows are kept
@@ -184,7 +186,7 @@ def test_places_are_converted_from_scene_units():
 def _condition(holds):
     """The largest condition number of the normalised products of the kept rows, over phases and scenes."""
     worst = 1.0
-    for w in holds.whitening.flatten(0, 1):
+    for w in holds.W.flatten(0, 1):
         w = w[: int((w.diagonal() != 0).sum())]
         product = torch.linalg.inv(w[:, : len(w)].T @ w[:, : len(w)])
         scale = product.diagonal().rsqrt()
@@ -207,8 +209,8 @@ def test_kept_rows_are_independent_at_any_angle(kind, most, patch):
         pin = PinnedRegion(Chosen(height > -STEP * patch), kind)
         solver = MPMSolver(DX, boundaries=[pin])
         solver.init_state(points)
-        holds = solver.bound.point_holds
-        assert int((holds.release[0, 0] > 0).sum()) >= 0.8 * 20 * STEP / DX
+        holds = solver.bound.pinned
+        assert int((holds.rows.release[0, 0] > 0).sum()) >= 0.8 * 20 * STEP / DX
         worst = max(worst, _condition(holds))
     assert 1.5 < worst < most
 
@@ -217,15 +219,15 @@ def test_a_line_along_the_grid_keeps_all_its_cells():
     points = _sheet(width=22, shift=(0.05, 0.02, 0.03))
     solver = MPMSolver(DX, boundaries=[PinnedRegion(Box([None, None, -0.001], [None] * 3), "hinge")])
     solver.init_state(points)
-    line = _own_places(solver.bound.point_holds)
+    line = _own_places(solver.bound.pinned)
     held = points.position[points.position[:, 2] > -0.001]
     assert len(line) == len(torch.unique(torch.floor(held / DX - 0.5), dim=0))
     solver = MPMSolver(DX, boundaries=[PinnedPoints(line.tolist(), "clamp")])
     solver.init_state(points)
-    holds = solver.bound.point_holds
-    slope = holds.slope[0, 0]
+    holds = solver.bound.pinned
+    slope = holds.rows.slope[0, 0]
     assert int((~slope).sum()) == len(line)
-    along = holds.place[0, 0][slope][:, 0] > 0
+    along = holds.rows.place[0, 0][slope][:, 0] > 0
     assert int(along.sum()) <= 2  # the slope along the line depends on the values, except at its ends
     assert int(slope.sum()) >= 2 * len(line)
 
@@ -233,11 +235,10 @@ def test_a_line_along_the_grid_keeps_all_its_cells():
 def test_rows_come_in_the_order_of_their_release():
     product = torch.eye(4, dtype=torch.float64)
     product[0, 1] = product[1, 0] = 0.99  # nearly the same row
-    everything = torch.ones(4, dtype=torch.bool)
     late = torch.tensor([False, True, False, True])
-    assert held_rows.independent_rows(product, [everything]).tolist() == [0, 2, 3]
-    assert held_rows.independent_rows(product, [late, ~late]).tolist() == [1, 3, 2]
-    assert held_rows.independent_rows(torch.zeros(2, 2, dtype=torch.float64), [everything[:2]]).tolist() == []
+    assert pinning.independent_rows(product, torch.zeros(4)).tolist() == [0, 2, 3]
+    assert pinning.independent_rows(product, 1.0 - late.double()).tolist() == [1, 3, 2]
+    assert pinning.independent_rows(torch.zeros(2, 2, dtype=torch.float64), torch.zeros(2)).tolist() == []
 
 
 def test_pins_in_the_same_cells_agree():
@@ -247,7 +248,7 @@ def test_pins_in_the_same_cells_agree():
     pins = [PinnedRegion(TOP), PinnedPoints(at), PinnedRegion(Box([0.3, None, -0.2], [None, None, -0.1]), "clamp")]
     solver = MPMSolver(DX, boundaries=[*pins, Plane([0, 0, -0.42], [0, 0, 1], "slip")])
     state = _run(solver, points, 200, force=_push(points), every=200)[-1]
-    places = _own_places(solver.bound.point_holds)
+    places = _own_places(solver.bound.pinned)
     assert len(places) >= 7
     assert float(_read(solver, places, state.node_displacement, state)[:, 0].abs().max()) < 1e-14
     assert state.impulse.shape == (4, 3)
@@ -266,7 +267,7 @@ def test_a_handle_moves_its_points_exactly(kind):
     handle = Handle(TOP, velocity, [0.0, 0.0, rate], pivot, kind)
     solver = MPMSolver(DX, boundaries=[handle])
     states = _run(solver, points, steps, dt, every=500)
-    rest = _own_places(solver.bound.point_holds)
+    rest = _own_places(solver.bound.pinned)
     for state in states[1:]:
         angle, time = rate * float(state.time), float(state.time)
         c, s = math.cos(angle), math.sin(angle)
@@ -290,7 +291,7 @@ def test_of_two_boundaries_at_the_same_place_the_last_one_counts():
     ):
         solver = MPMSolver(DX, boundaries=boundaries)
         state = _run(solver, points, 2)[-1]
-        found = _read(solver, _own_places(solver.bound.point_holds), state.node_velocity, state)[:, 0]
+        found = _read(solver, _own_places(solver.bound.pinned), state.node_velocity, state)[:, 0]
         assert_close(found, torch.tensor([[0.0, speed, 0.0]], dtype=torch.float64).expand_as(found))
 
 
@@ -298,7 +299,7 @@ def test_a_pin_that_opens_lets_go():
     pin = PinnedRegion(TOP, end=0.0055)
     solver = MPMSolver(DX, boundaries=[pin])
     state = _run(solver, _sheet(), 5, every=5)[-1]
-    places = _own_places(solver.bound.point_holds)
+    places = _own_places(solver.bound.pinned)
     for _ in range(3):
         state = solver.step(state, 1e-3)
     assert bool((_read(solver, places, state.node_velocity, state)[:, 0, 2] < -0.015).all())
@@ -315,7 +316,7 @@ def test_pins_act_within_their_windows():
     ]
     solver = MPMSolver(DX, boundaries=pins)
     states = _run(solver, points, 200, dt, force=_push(points))
-    holds = solver.bound.point_holds
+    holds = solver.bound.pinned
     assert holds.starts.tolist() == [0.0495, 0.0795]
     for places, first, last in ((None, 0, 149), ([[0.1, 0.0, -0.25]], 50, 200), ([[0.3, 0.0, -0.3]], 80, 200)):
         places = _own_places(holds) if places is None else places
@@ -337,8 +338,8 @@ def test_points_are_released_one_by_one():
     release = SequentialRelease(TOP, [1.0, 0.0, 0.0], start=0.02, end=0.12)
     solver = MPMSolver(DX, boundaries=[release])
     states = _run(solver, points, 160)
-    holds = solver.bound.point_holds
-    rest, when = _own_places(holds), holds.release[0, 0]
+    holds = solver.bound.pinned
+    rest, when = _own_places(holds), holds.rows.release[0, 0]
     assert when.tolist() == sorted(when.tolist(), reverse=True)
     assert len(set(when.tolist())) == len(torch.unique(torch.floor(rest[:, 0] / DX - 0.5)))
     held = TOP.contains(points.position)
@@ -475,7 +476,7 @@ def test_a_subclass_with_its_own_forward_acts_on_nodes():
     solver = MPMSolver(DX, boundaries=[Stopper(TOP), Lifter(Box([None] * 3, [None, None, -0.4]))])
     state = _run(solver, _sheet(), 3, every=3)[-1]
     assert solver.bound.kinds == ("nodes", "hinge")
-    places = _own_places(solver.bound.point_holds)
+    places = _own_places(solver.bound.pinned)
     speed = _read(solver, places, state.node_velocity, state)[:, 0]
     assert_close(speed, torch.ones_like(speed), rtol=0, atol=1e-13)
 
@@ -496,7 +497,7 @@ def test_a_place_far_from_the_material_is_refused():
 
 
 def test_too_many_rows_are_refused(monkeypatch):
-    monkeypatch.setattr(point_holds, "MOST_ROWS", 9)
+    monkeypatch.setattr(pinning, "MOST_ROWS", 9)
     solver = MPMSolver(DX, boundaries=[PinnedRegion(Everything())])
     with pytest.raises(
         ValueError, match=r"hold \d+ points and slopes, more than the 9 .* `kind` of the PinnedRegion to"
@@ -533,7 +534,7 @@ def test_a_cell_beside_a_place_has_all_the_nodes_that_it_needs(place, massless, 
         position = 0.5 * (node + torch.tensor(grid.offset))
         index = torch.cartesian_prod(*(torch.arange(count) for count in grid.resolution))
         massive = ~torch.isin(index[:, axis], torch.tensor(massless, dtype=torch.long))
-        found = int(point_holds.cells_of_places(position[None], grid, massive))
+        found = int(pinning.cells_of_places(position[None], grid, massive))
         if first == -1:
             assert found == -1
         else:

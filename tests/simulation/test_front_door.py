@@ -273,7 +273,7 @@ def test_a_coefficient_changed_in_place_is_felt():
     ("hold", "kind"),
     [
         (POLE, "hinge"),
-        (PinnedRegion(POLE, kind="clamp"), "clamp"),
+        (PinnedRegion(POLE, kind="clamp"), "face"),
         (PinnedRegion(POLE, kind="nodes"), "nodes"),
         (PinnedPoints([[0.05, 0.0, 0.75], [0.05, 0.0, 0.05]]), "hinge"),
     ],
@@ -283,7 +283,7 @@ def test_what_is_held_has_a_kind(hold, kind):
     simulation.start()
     assert list(simulation.solver.bound.kinds) == [kind]
     assert tuple(simulation.solver.gravity) == (0.0, 0.0, 0.0)
-    assert ("clamp" in simulation.config) == (kind == "clamp")  # a run is resumed with the same pins
+    assert ("clamp" in simulation.config) == (kind == "face")  # a run is resumed with the same pins
 
 
 FALLS = "Nothing holds the object"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,8 +13,7 @@ from gaussian_swaying.kernels.graphs import RECORDED
 from gaussian_swaying.kernels.language import triton
 from gaussian_swaying.kernels.launch import lanes, launch
 from gaussian_swaying.mpm.forces import Force, divide, tensors_of
-from gaussian_swaying.mpm.pins import PinnedPoints, PinnedRegion
-from gaussian_swaying.mpm.point_holds import DenseHolds
+from gaussian_swaying.mpm.pins import InKernels, PinnedPoints, PinnedRegion
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.timestep import kick_time
 from gaussian_swaying.mpm.total import Total
@@ -104,7 +102,7 @@ class FusedTotal(Fused):
         self.taken_and_done = torch.zeros(self.impulse.numel() + self.scenes, dtype=torch.float64, device=self.device)
         pins = (PinnedRegion, PinnedPoints)
         self.plain = all(
-            kind == "surface" or (type(b) in pins and b.start <= 0 and b.end == math.inf)
+            kind == "surface" or (type(b) in pins and b.always)
             for b, kind in zip(bound.boundaries, bound.kinds, strict=True)
         )
         """True if the kernels apply all boundaries but obstacles, which are contact."""
@@ -166,9 +164,9 @@ class FusedTotal(Fused):
         self.taken = torch.zeros(len(active) + 1, 4, **self.like)
         scene = active // self.grid.node_count
         self.own_nodes = [_by_scene((owner == k).nonzero()[:, 0], scene, self.scenes) for k in range(len(bound.held))]
-        self.points: DenseHolds | None = None
-        if self.plain and bound.point_holds is not None:
-            self.points = bound.point_holds.dense(self.like["dtype"])
+        self.points: InKernels | None = None
+        if self.plain and bound.pinned is not None:
+            self.points = bound.pinned.in_kernels(self.like["dtype"])
             check_indices(self.points.push.numel())
             self.residual = torch.zeros(2, self.points.node.shape[1], 4, **self.like)  # now, and its sum
 
@@ -308,7 +306,7 @@ class FusedTotal(Fused):
         if not self.plain or self.asked or (self.touching is not None and self.touching.walls):
             self.pass_time()
 
-    def _hold_points(self, points: DenseHolds, offset: int) -> None:
+    def _hold_points(self, points: InKernels, offset: int) -> None:
         """Stop the held points: their velocities, then those of the nodes around them."""
         rows, block = points.node.shape[1], lanes(self.device, 4, 1)
         launch(kernels.total_rows, (-(-rows // block),))(
@@ -511,25 +509,15 @@ class DifferentiableTotal(FusedTotal):
 
     def _take_rows(self) -> None:
         """The held points as dense matrices: what rows push, and their weights on the nodes that they move."""
-        points = self.points
-        if points is None:
+        points, pinned = self.points, self.bound.pinned
+        if points is None or pinned is None:
             return
         place = torch.full((self.bound.node_mass.numel(),), -1, dtype=torch.int32, device=self.device)
         place[self.place] = torch.arange(self.nodes, dtype=torch.int32, device=self.device)
-        own = place[points.affected.long()]
-        massive = (own >= 0).nonzero()[:, 0]  # others never move
-        self.affected, self.scene = own[massive].contiguous(), points.scene[massive].contiguous()
-        self.push = points.push[massive].T.contiguous()
-        rows = points.push.shape[1]
-        where = torch.full_like(place, len(massive)).index_copy(
-            0, points.affected.long()[massive], torch.arange(len(massive), dtype=torch.int32, device=self.device)
-        )
-        row = (torch.arange(points.node.shape[1], device=self.device) % rows).expand_as(points.node)
-        weight = torch.zeros(len(massive) + 1, rows, **self.like)
-        weight.index_put_((where[points.node.long()].long(), row), points.weight, accumulate=True)
-        self.weight = weight[:-1].contiguous()
+        self.affected, self.scene = place[points.affected.long()].contiguous(), points.scene
+        self.push = points.push.T.contiguous()
+        self.weight = pinned.C[0].mT[pinned.real].to(self.push).contiguous()
         self.weight_bar = torch.zeros_like(self.weight)
-        self.entry = (where[points.node.long()].long(), row)
         self.row_bar = torch.zeros(points.node.shape[1], 4, **self.like)
         self.multipliers = self.row_history = torch.zeros(0, len(self.row_bar), 4, **self.like)
 
@@ -583,10 +571,10 @@ class DifferentiableTotal(FusedTotal):
             vectors = twin.per_substep.take(state.time, torch.full_like(state.time, dt), steps)
             numbers = torch.as_tensor(twin.numbers.take())
         bound = self.bound
-        laws, points, holds = bound.laws, bound.points, bound.point_holds
+        laws, points, pinned = bound.laws, bound.points, bound.pinned
         displacement, velocity = _Rollout.apply(
             run, *state.nodal, laws.mu, laws.lam, points.volume,
-            bound.node_inverse_mass, None if holds is None else holds.weight,
+            bound.node_inverse_mass, None if pinned is None else pinned.C,
             None if bound.bending is None else bound.bending.stiffness, vectors, numbers,
         )  # fmt: skip
         end = run.state
@@ -663,10 +651,10 @@ class DifferentiableTotal(FusedTotal):
         mass = torch.zeros(inverse.numel(), **self.like).index_copy(0, self.place, self.mass_bar)
         found["inverse_mass"] = mass.reshape(inverse.shape)
         found["stiffness"] = self.stiffness_bar[:, :, :27]
-        if self.points is not None and bound.point_holds is not None:
-            padded = torch.nn.functional.pad(self.weight_bar, (0, 0, 0, 1))
-            weight = bound.point_holds.weight
-            found["weight"] = padded[self.entry].T.reshape(weight.shape).to(weight)
+        if self.points is not None and bound.pinned is not None:
+            weight = torch.zeros_like(bound.pinned.C)
+            weight[0].mT[bound.pinned.real] = self.weight_bar.to(weight)
+            found["weight"] = weight
         if vectors is not None and numbers is not None and vector_bars:
             by_vectors = torch.cat(vector_bars[::-1])
             by_vectors = by_vectors.reshape(vectors.shape) if vectors.ndim > 2 else by_vectors.sum(1)
@@ -708,10 +696,10 @@ class DifferentiableTotal(FusedTotal):
             self.shares = torch.zeros(every, self.pieces, 8, **self.like)
 
     def _find_multipliers(self, count: int) -> None:
-        holds = self.bound.point_holds
-        assert holds is not None
-        W = holds.whitening[0]
-        rates = self.row_history[1 : count + 1].reshape(count, holds.scenes, holds.rows, 4).double()
+        pinned = self.bound.pinned
+        assert pinned is not None
+        W = pinned.W[0]
+        rates = self.row_history[1 : count + 1].reshape(count, *W.shape[:2], 4).double()
         found = torch.einsum("sij,csjx->csix", W.mT @ W, rates)
         self.multipliers[:count].copy_(found.reshape(count, -1, 4))
 

@@ -113,7 +113,7 @@ def _check_boundary(boundary: Any) -> None:
     if type(boundary) not in (PinnedRegion, PinnedPoints, Plane):
         known = ", ".join(one.__name__ for one in (PinnedRegion, PinnedPoints, Plane, *OBSTACLES))
         raise _refused(f"the {name} in `solver.boundaries`", f"take one of {known}")
-    if type(boundary) is not Plane and not (boundary.holds_from <= 0 and boundary.end == math.inf):
+    if type(boundary) is not Plane and not boundary.always:
         raise _refused(f"`start` and `end` of the {name}", "leave them out")
 
 
@@ -187,8 +187,8 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
         **_samples(bound, row),
     }
     rows = 0
-    if bound.point_holds is not None:
-        dense = bound.point_holds.dense(torch.float64)
+    if bound.pinned is not None:
+        dense = bound.pinned.in_kernels(torch.float64)
         rows = dense.push.shape[1]
         arrays |= {"rowNode": row[dense.node.long()].T, "rowWeight": dense.weight.T}
         arrays |= {"affected": row[dense.affected.long()], "push": dense.push}

@@ -384,7 +384,7 @@ export class Solver extends Body {
     }
   }
 
-  /** Stops the held points exactly, see gaussian_swaying/mpm/point_holds.py. */
+  /** Stops the held points exactly, see gaussian_swaying/mpm/pins.py. */
   hold() {
     const { velocity: V, rates } = this;
     const { rowNode, rowWeight, affected, push } = this.a;
