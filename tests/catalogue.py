@@ -25,6 +25,7 @@ ELASTIC = {
     "neo-hookean": LAWS["NeoHookean"](),
     "springs": LAWS["SpringNetwork"](),
     "hencky": LAWS["StVKHencky"](),
+    "simo corotated": LAWS["SimoCorotated"](),
 }
 PLASTIC = {
     "sand": LAWS["Sand"](),
