@@ -25,7 +25,6 @@ ELASTIC = {
     "neo-hookean": LAWS["NeoHookean"](),
     "springs": LAWS["SpringNetwork"](),
     "hencky": LAWS["StVKHencky"](),
-    "simo corotated": LAWS["SimoCorotated"](),
 }
 PLASTIC = {
     "sand": LAWS["Sand"](),

@@ -62,13 +62,6 @@ def plume(v, x, numbers, now, table, OPTIONS: tl.constexpr):
     return v[0] + drawn * a, v[1] + drawn * b, v[2] + up * fall
 
 
-@triton.jit
-def sheared(v, position, numbers, now, table, OPTIONS: tl.constexpr):
-    """``LinearShear``."""
-    change = numbers[1] * (position[2] - numbers[0])
-    return v[0] * (1 + change), v[1] * (1 + change), v[2] + 0 * change
-
-
 @dataclass(frozen=True)
 class Moment:
     """The wind at one time, as the effects get it; their twins get n times at once.
@@ -204,19 +197,6 @@ class PowerProfile(Profile):
     def twin(self) -> Twin:
         numbers = Numbers(3, lambda: [self.ground[2], 1 / self.height, self.exponent])
         return Twin(power_profile, numbers=numbers, sources=(self,))
-
-
-class LinearShear(Profile):
-    """A wind that grows by the same speed with each metre of height.
-
-    Args:
-        ground: A point on the ground, in scene units; only its height counts.
-        height: Height above the ground at which the wind is that of the ``flow`` [m].
-    """
-
-    def twin(self) -> Twin:
-        numbers = Numbers(2, lambda: [self.ground[2] + self.height, 1 / self.height])
-        return Twin(sheared, numbers=numbers, sources=(self,))
 
 
 class Plume(WindEffect):

@@ -91,8 +91,7 @@ def wind_terms(air, relative, facing, across, through, tangent, numbers, LAW: tl
     else:
         pressure = pressure * drag_speed(air, relative, LAW)
     side = cross3(relative, facing)
-    force = add3(axpy3(pressure, pressed, numbers[1] * speed, tangent), numbers[2] * speed, side)
-    return add3(force, numbers[5], tangent)  # laminar friction, which grows with the speed alone
+    return add3(axpy3(pressure, pressed, numbers[1] * speed, tangent), numbers[2] * speed, side)
 
 
 @triton.jit
@@ -278,7 +277,7 @@ def force_adjoint(groups: bool, law: int) -> Any:
         force, _ = on_tensors(function)(F, velocity, point, numbers, air, table, law)
         return gradient(force, (F, velocity, air, numbers[:3]), a)
 
-    shapes = {"F": 9, "velocity": 3, "point": 2 if groups else 4, "numbers": 6, "now": 3, "table": 0, "a": 3}
+    shapes = {"F": 9, "velocity": 3, "point": 2 if groups else 4, "numbers": 5, "now": 3, "table": 0, "a": 3}
     return device_function(f"{function.__name__}_adjoint", shapes, formula)
 
 
@@ -293,7 +292,6 @@ def aero_force(
     lift: Tensor | float,
     air_density: float = 1.225,
     law: str = "paper",
-    laminar: float = 0.0,
 ) -> Tensor:
     r"""Drag, friction and lift on patches in relative wind (paper, "Aerodynamics").
 
@@ -323,7 +321,6 @@ def aero_force(
             alone, :math:`\tfrac12 \rho A C_D |\mathbf{v}_r \cdot \mathbf{n}| (\mathbf{v}_r \cdot \mathbf{n})\,
             \mathbf{n}` (the independence principle: Taylor 1952; Gosselin, de Langre & Machado-Almeida 2010, JFM 650,
             319, for plates that bend). Friction and lift are those of the other laws.
-        laminar: Friction along the patch that grows with the speed alone, over half the density of the air [m/s].
 
     Returns:
         Force [N], shape (..., P, 3).
@@ -338,13 +335,7 @@ def aero_force(
     check_shape("area", area, patches)
     check_shape("wind", wind, 3)
     numbers = tuple(part.to(velocity) if isinstance(part, Tensor) else part for part in (drag, friction, lift))
-    given = (
-        wind.to(velocity).unbind(-1),
-        velocity.unbind(-1),
-        normal.unbind(-1),
-        area,
-        (*numbers, 0.5 * air_density, math.inf, laminar),
-    )
+    given = wind.to(velocity).unbind(-1), velocity.unbind(-1), normal.unbind(-1), area, (*numbers, 0.5 * air_density)
     return torch.stack(torch.broadcast_tensors(*on_tensors(patch_force)(*given, LAWS.index(law))), dim=-1)
 
 
@@ -412,10 +403,8 @@ class AeroForce(Fixed, nn.Module):
         drag_step: Literal["explicit", "semi_implicit"] = "explicit",
         max_area_ratio: float | None = None,
         added_mass: float = 0.0,
-        laminar: float = 0.0,
     ) -> None:
         super().__init__()
-        self.laminar = float(laminar)
         numbers = {"C_D": number_of(C_D), "C_F": number_of(C_F), "air_density": air_density, "added_mass": added_mass}
         for name, value in numbers.items():
             check_positive(name, value, allow_zero=True)
@@ -508,13 +497,13 @@ class AeroForce(Fixed, nn.Module):
         """
         return aero_force(
             wind, velocity, normal, area, drag=self.C_D, friction=self.C_F, lift=self.C_L,
-            air_density=self.air_density, law=self.law, laminar=self.laminar,
+            air_density=self.air_density, law=self.law,
         )  # fmt: skip
 
     def numbers(self) -> Tensor:
         """The coefficients, half the density of the air, and the largest ratio of areas, shape (5,), float64."""
-        plain = 0.5 * self.air_density, self.max_area_ratio, self.laminar
-        return torch.stack([self.C_D, self.C_F, self.C_L, *(torch.full_like(self.C_D, value) for value in plain)])
+        half, widest = (torch.full_like(self.C_D, value) for value in (0.5 * self.air_density, self.max_area_ratio))
+        return torch.stack([self.C_D, self.C_F, self.C_L, half, widest])
 
     def on_patches(
         self, wind: Tensor, velocity: Tensor, deformation_gradient: Tensor, patches: PatchSums | tuple[Tensor, Tensor]
@@ -878,7 +867,7 @@ class WindForce(Force):
         return Twin(
             wind_force,
             options=(law, implicit, groups),
-            numbers=Numbers(6, aero.numbers),
+            numbers=Numbers(5, aero.numbers),
             per_substep=Numbers(width, partial(self._with_effects, parts) if parts else self.winds),
             implicit=implicit,
             parts=parts,

@@ -18,7 +18,6 @@ from gaussian_swaying.wind import effects
 from gaussian_swaying.wind.effects import (
     CylinderObstacle,
     EllipsoidObstacle,
-    LinearShear,
     LogProfile,
     Moment,
     Plume,
@@ -50,10 +49,6 @@ def test_the_logarithmic_profile():
 def test_the_power_law():
     found = speeds(PowerProfile(ground=(0.0, 0.0, 1.0), height=10.0, exponent=0.2), [11.0, 1.3125, 0.5])
     assert found == pytest.approx([8.0, 8.0 * 0.03125**0.2, 0.0])  # 0.03125 is half to the fifth
-
-
-def test_a_linear_shear():
-    assert speeds(LinearShear(ground=(0.0, 0.0, 1.0), height=10.0), [11.0, 6.0, 1.0]) == pytest.approx([8.0, 4.0, 0.0])
 
 
 def test_a_roughness_above_the_height_is_refused():

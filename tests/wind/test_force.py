@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from shared import double, unit
+from shared import unit
 from torch.testing import assert_close
 
 from gaussian_swaying import AeroForce, aero_force
@@ -200,12 +200,3 @@ def test_shapes_are_checked():
         arguments[position] = bad
         with pytest.raises(ValueError, match=f"Expected `{name}` of shape"):
             AeroForce()(*arguments)
-
-
-def test_laminar_friction_grows_with_the_speed():
-    """Along the patch alone, in kernels as in torch."""
-    normal, area = double([[0.0, 0.0, 1.0]]), double([0.5])
-    still = torch.zeros(1, 3, dtype=torch.float64)
-    none = {"drag": 0.0, "friction": 0.0, "lift": 0.0, "air_density": 2.0, "laminar": 3.0}
-    found = aero_force(double([4.0, 0.0, 9.0]), still, normal, area, **none)
-    assert found.tolist() == [[0.5 * 3.0 * 4.0, 0.0, 0.0]]

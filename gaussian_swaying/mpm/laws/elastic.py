@@ -192,21 +192,3 @@ class SpringNetwork(ConstitutiveLaw):
     """
 
     device = DeviceLaw(energy=spring_network_energy)
-
-
-@triton.jit
-def simo_corotated_energy(a, mu, lam, internal, p):
-    r"""Energy density :math:`\mu \lVert F - R \rVert^2 + \tfrac{\lambda}{2} (\tfrac12 (J^2 - 1) - \log J)` [J/m³].
-
-    Simo & Miehe 1992, "Associative coupled thermoplasticity at finite strains", for the volume.
-    """
-    d = (a[0] - 1, a[1] - 1, a[2] - 1)
-    ratio = a[0] * a[1] * a[2]
-    return mu * dot3(d, d) + 0.5 * lam * (0.5 * (ratio * ratio - 1) - log(ratio))
-
-
-class SimoCorotated(ConstitutiveLaw):
-    """Corotated elasticity that resists crushing without limit."""
-
-    device = DeviceLaw(energy=simo_corotated_energy)
-    least_nu = 0.0
