@@ -28,6 +28,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from gaussian_swaying.geometry.linalg_triton import add3, dot3, load3, store3, where3
 from gaussian_swaying.kernels.derive import on_tensors
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.kernels.launch import lanes, launch
@@ -236,19 +237,15 @@ def hold_faces(moments, held, behind, outward, wind, cells, count, BLOCK: tl.con
     mask = lane < cells
     at = tl.load(held + lane, mask, 0)
     near = _load_moments(moments, tl.load(behind + lane, mask, 0), count, mask)
-    ox = tl.load(outward + 3 * lane, mask, 1.0)
-    oy = tl.load(outward + 3 * lane + 1, mask, 0.0)
-    oz = tl.load(outward + 3 * lane + 2, mask, 0.0)
-    x = tl.load(wind + 3 * lane, mask, 0.0)
-    y = tl.load(wind + 3 * lane + 1, mask, 0.0)
-    z = tl.load(wind + 3 * lane + 2, mask, 0.0)
-    out = x * ox + y * oy + z * oz > 1e-6
-    into = tl.minimum(near[1] * ox + near[2] * oy + near[3] * oz, 0.0) / (ox * ox + oy * oy + oz * oz)
+    away = load3(outward, 1, 3 * lane, mask)
+    blown = load3(wind, 1, 3 * lane, mask)
+    leaving = (near[1], near[2], near[3])
+    square = tl.where(mask, dot3(away, away), 1.0)
+    out = dot3(blown, away) > 1e-6
+    leaving = add3(leaving, -tl.minimum(dot3(leaving, away), 0.0) / square, away)
+    blown = add3(blown, 0.5773502691896258 * near[0] / tl.sqrt(square), away)
     tl.store(moments + at, tl.where(out, 0.0, near[0]), mask)
-    sound = 0.5773502691896258 * near[0] / tl.sqrt(ox * ox + oy * oy + oz * oz)
-    tl.store(moments + count + at, tl.where(out, near[1] - into * ox, x + sound * ox), mask)
-    tl.store(moments + 2 * count + at, tl.where(out, near[2] - into * oy, y + sound * oy), mask)
-    tl.store(moments + 3 * count + at, tl.where(out, near[3] - into * oz, z + sound * oz), mask)
+    store3(moments + count, count, at, where3(out, leaving, blown), mask)
     for q in tl.static_range(4, 10):
         tl.store(moments + q * count + at, near[q], mask)
 

@@ -27,6 +27,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gaussian_swaying.geometry.linalg_triton import add3, load3, scale3, store3
 from gaussian_swaying.kernels.language import INTERPRETED, tl, triton
 from gaussian_swaying.kernels.launch import lanes, launch
 
@@ -68,9 +69,10 @@ def _cell(reach, kind, nx, ny, nz, mask, Q: tl.constexpr):
 @triton.jit
 def _reach(place, p, kind, nx, ny, nz, mask):
     """The cells around points, and a factor with which the weights of those of air add up to one."""
-    bx, wx = _axis(tl.load(place + 3 * p, mask, 0.0))
-    by, wy = _axis(tl.load(place + 3 * p + 1, mask, 0.0))
-    bz, wz = _axis(tl.load(place + 3 * p + 2, mask, 0.0))
+    x, y, z = load3(place, 1, 3 * p, mask)
+    bx, wx = _axis(x)
+    by, wy = _axis(y)
+    bz, wz = _axis(z)
     reach = (bx, wx, by, wy, bz, wz)
     total = wx[0] * 0.0
     for q in tl.static_range(27):
@@ -107,21 +109,15 @@ def read(place, area, field, sums, values, layer, kind, nx, ny, nz, cells, count
     mask = p < count
     reach, scale = _reach(place, p, kind, nx, ny, nz, mask)
     covered = scale * 0.0
-    x = scale * 0.0
-    y = scale * 0.0
-    z = scale * 0.0
+    found = (covered, covered, covered)
     for q in tl.static_range(27):
         at, w = _cell(reach, kind, nx, ny, nz, mask, q)
         covered += w * tl.load(sums + at, mask, 0.0)
-        x += w * tl.load(field + at, mask, 0.0)
-        y += w * tl.load(field + cells + at, mask, 0.0)
-        z += w * tl.load(field + 2 * cells + at, mask, 0.0)
+        found = add3(found, w, load3(field, cells, at, mask))
     covered = covered * scale
     mass = tl.where(covered > 0, tl.load(area + p, mask, 0.0) / tl.maximum(covered, 1e-30), 0.0)
     tl.store(layer + p, mass, mask)
-    tl.store(values + 3 * p, x * scale, mask)
-    tl.store(values + 3 * p + 1, y * scale, mask)
-    tl.store(values + 3 * p + 2, z * scale, mask)
+    store3(values, 1, 3 * p, scale3(scale, found), mask)
 
 
 @triton.jit
@@ -131,15 +127,12 @@ def subtract(place, taken, moments, kind, nx, ny, nz, cells, count, rounds, ATOM
         p = (tl.program_id(0) * rounds + turn) * BLOCK + tl.arange(0, BLOCK)
         mask = p < count
         reach, scale = _reach(place, p, kind, nx, ny, nz, mask)
-        x = scale * tl.load(taken + 3 * p, mask, 0.0)
-        y = scale * tl.load(taken + 3 * p + 1, mask, 0.0)
-        z = scale * tl.load(taken + 3 * p + 2, mask, 0.0)
+        share = scale3(scale, load3(taken, 1, 3 * p, mask))
         for q in tl.static_range(27):
             at, w = _cell(reach, kind, nx, ny, nz, mask, q)
             w = -w / (1.0 + tl.load(moments + at, mask, 0.0))
-            _add(moments + cells + at, w * x, mask, ATOMIC)
-            _add(moments + 2 * cells + at, w * y, mask, ATOMIC)
-            _add(moments + 3 * cells + at, w * z, mask, ATOMIC)
+            for k in tl.static_range(3):
+                _add(moments + (k + 1) * cells + at, w * share[k], mask, ATOMIC)
 
 
 def look(moments: Tensor, area: Tensor, place: Tensor, kind: Tensor) -> tuple[Tensor, Tensor]:
