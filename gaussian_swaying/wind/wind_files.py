@@ -51,18 +51,14 @@ class TurbSimWind:
         spacing: Sides of a cell [m], across and up.
         dt: Time between planes [s].
         speed: Mean wind at the hub [m/s].
-        hub: Height of the hub above the ground [m].
         bottom: Height of the lowest row [m].
-        periodic: Whether the last plane continues in the first.
     """
 
     velocity: np.ndarray
     spacing: tuple[float, float]
     dt: float
     speed: float
-    hub: float
     bottom: float
-    periodic: bool
 
 
 def read_bts(path: str | os.PathLike[str]) -> TurbSimWind:
@@ -72,7 +68,7 @@ def read_bts(path: str | os.PathLike[str]) -> TurbSimWind:
     head = struct.Struct("<h4i12fi")
     if len(data) < head.size or struct.unpack_from("<h", data)[0] not in (7, 8):
         raise ValueError(f"{path} is not a full-field file of TurbSim (.bts): write one with WrADFF = True.")
-    kind, nz, ny, towers, nt, dz, dy, dt, speed, hub, bottom, *scales, letters = head.unpack_from(data)
+    _, nz, ny, towers, nt, dz, dy, dt, speed, hub, bottom, *scales, letters = head.unpack_from(data)
     start = head.size + letters
     count = nt * (ny * nz + towers) * 3
     sizes = (nz >= 1, ny >= 2, nt >= 2, towers >= 0, letters >= 0, dt > 0, speed > 0, _is_step(dz), _is_step(dy))
@@ -85,7 +81,7 @@ def read_bts(path: str | os.PathLike[str]) -> TurbSimWind:
         )
     raw = np.frombuffer(data, "<i2", count, start).reshape(nt, -1, 3)[:, : ny * nz].reshape(nt, nz, ny, 3)
     velocity = ((raw - np.array(scales[1::2])) / slopes).astype(np.float32).transpose(0, 2, 1, 3)
-    return TurbSimWind(np.ascontiguousarray(velocity), (dy, dz), dt, speed, hub, bottom, kind == 8)
+    return TurbSimWind(np.ascontiguousarray(velocity), (dy, dz), dt, speed, bottom)
 
 
 def read_grid(path: str | os.PathLike[str]) -> GridWind:
@@ -98,9 +94,7 @@ def read_grid(path: str | os.PathLike[str]) -> GridWind:
     path = check_regular(path, "the wind", LARGEST)
     if path.suffix == ".npz":
         found = read_arrays(path, "the wind", ("x", "y", "z", "velocity"), ("time", "units"))
-        units = str(found.get("units", ""))
-        if _plain(units) not in _SPEEDS:
-            raise _unit(path, "velocity", units, "m/s")
+        _check_units(path, "velocity", str(found.get("units", "")), _SPEEDS)
         names: list[str] = [name for name in ("time", *"xyz") if name in found]
         axes, velocity = {name: found[name] for name in names}, found["velocity"]
     elif path.suffix in (".nc", ".nc4"):
@@ -188,9 +182,7 @@ def _read_netcdf(path: Path) -> tuple[dict[str, np.ndarray], np.ndarray]:
         axes = {}
         for name, known in (("time", ("", "s", "sec", "second", "seconds")), *((n, _METRES) for n in "xyz")):
             if name in variables:
-                units = _units(variables[name])
-                if _plain(units.split(" since ")[0]) not in known:
-                    raise _unit(path, name, units, known[1])
+                _check_units(path, name, _units(variables[name]), known)
                 axes[name] = np.array(variables[name][:], dtype=np.float64)
         for name in "xyz":
             if name not in axes:
@@ -209,9 +201,7 @@ def _read_netcdf(path: Path) -> tuple[dict[str, np.ndarray], np.ndarray]:
 
 
 def _turned(path: Path, variable: Any, order: list[str]) -> np.ndarray:
-    units = _units(variable)
-    if _plain(units) not in _SPEEDS:
-        raise _unit(path, "velocity", units, "m/s")
+    _check_units(path, "velocity", _units(variable), _SPEEDS)
     if set(variable.dimensions) != set(order):
         raise ValueError(f"The components in {path} have different axes: save all on {', '.join(order)}.")
     return np.array(variable[:]).transpose([variable.dimensions.index(name) for name in order])
@@ -226,8 +216,10 @@ def _plain(units: str) -> str:
     return re.sub(r"[\s.·]", "", units).lower()
 
 
-def _unit(path: Path, name: str, units: str, wanted: str) -> ValueError:
-    return ValueError(f"`{name}` in {path} is in {units!r}, not in {wanted}: convert it first.")
+def _check_units(path: Path, name: str, units: str, known: tuple[str, ...]) -> None:
+    """Refuse units other than those that are known, of which the second is the usual one."""
+    if _plain(units.split(" since ")[0]) not in known:
+        raise ValueError(f"`{name}` in {path} is in {units!r}, not in {known[1]}: convert it first.")
 
 
 def read_anemometer(path: str | os.PathLike[str]) -> tuple[list[float], list[list[float]]]:
@@ -246,14 +238,15 @@ def read_anemometer(path: str | os.PathLike[str]) -> tuple[list[float], list[lis
             rows = [row for row in csv.reader(file) if any(cell.strip() for cell in row)]
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path} is not a CSV in UTF-8 ({error}): export it again.") from error
-    known = {"time": "s", "u": "m/s", "v": "m/s", "w": "m/s", "speed": "m/s", "direction": "deg"}
+    known = {"time": ("", "s"), "direction": ("", "deg", "°"), **dict.fromkeys(("u", "v", "w", "speed"), ("", "m/s"))}
     columns: dict[str, int] = {}
     for number, cell in enumerate(rows[0] if rows else []):
         match = re.fullmatch(r"\s*([A-Za-z]+)\s*(?:[\[(](.*)[\])])?\s*", cell)
         name = match[1].lower() if match else ""
         if match and name in known:
-            if _plain(match[2] or known[name]) not in (_plain(known[name]), "°" if name == "direction" else ""):
-                raise _unit(path, name, match[2], known[name])
+            _check_units(
+                path, name, match[2] or "", ("", known[name], "°") if name == "direction" else ("", known[name])
+            )
             if name in columns:
                 raise ValueError(f"{path} has two columns `{name}`: remove or rename one.")
             columns[name] = number
@@ -262,10 +255,10 @@ def read_anemometer(path: str | os.PathLike[str]) -> tuple[list[float], list[lis
     for name in needed:
         if name not in columns:
             raise ValueError(
-                f"{path} has no column `{name} [{known[name]}]`: it needs time, and u and v or speed and direction."
+                f"{path} has no column `{name} [{known[name][1]}]`: it needs time, and u and v or speed and direction."
             )
     wanted = [*needed, *(["w"] if "w" in columns else [])]
-    values = []
+    times, flows = [], []
     for line, row in enumerate(rows[1:], start=2):
         try:
             numbers = [float(row[columns[name]]) for name in wanted]
@@ -273,13 +266,12 @@ def read_anemometer(path: str | os.PathLike[str]) -> tuple[list[float], list[lis
             numbers = [math.nan]
         if not all(map(math.isfinite, numbers)):
             raise ValueError(f"Line {line} of {path} has no number for each of {', '.join(wanted)}: fill or remove it.")
-        values.append(numbers)
-    if not values:
-        raise ValueError(f"{path} has no measurements: check the file.")
-    flows = []
-    for _, first, second, *up in values:
+        time, first, second, *up = numbers
         if polar:
             angle = math.radians(second)
             first, second = -first * math.sin(angle), -first * math.cos(angle)
-        flows.append([first, second, up[0] if up else 0.0])
-    return [row[0] for row in values], flows
+        times.append(time)
+        flows.append([first, second, *(up or [0.0])])
+    if not times:
+        raise ValueError(f"{path} has no measurements: check the file.")
+    return times, flows
