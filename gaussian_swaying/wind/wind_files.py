@@ -244,9 +244,7 @@ def read_anemometer(path: str | os.PathLike[str]) -> tuple[list[float], list[lis
         match = re.fullmatch(r"\s*([A-Za-z]+)\s*(?:[\[(](.*)[\])])?\s*", cell)
         name = match[1].lower() if match else ""
         if match and name in known:
-            _check_units(
-                path, name, match[2] or "", ("", known[name], "°") if name == "direction" else ("", known[name])
-            )
+            _check_units(path, name, match[2] or "", known[name])
             if name in columns:
                 raise ValueError(f"{path} has two columns `{name}`: remove or rename one.")
             columns[name] = number
