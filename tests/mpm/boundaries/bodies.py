@@ -1,15 +1,24 @@
 """Small bodies, and short runs of them."""
 
+import pytest
 import torch
-from shared import solid
+from shared import double, solid
+from torch.testing import assert_close
 
 from gaussian_swaying import MaterialPoints, MPMSolver
+
+in_both = pytest.mark.parametrize("formulation", ["total", "updated"])
+
+
+def near(found, expected, within):
+    """The two differ by no more than an absolute bound."""
+    assert_close(found, expected, rtol=0, atol=within)
 
 
 def block(low=(0.0, 0.0, 0.0), side=0.4, e=2e4, per_side=6):
     axis = (torch.arange(per_side, dtype=torch.float64) + 0.5) * side / per_side
     position = torch.cartesian_prod(axis, axis, axis)
-    return solid(position + torch.tensor(low, dtype=torch.float64), (side / per_side) ** 3, 100.0, e)
+    return solid(position + double(low), (side / per_side) ** 3, 100.0, e)
 
 
 def run_for(
@@ -26,7 +35,7 @@ def run_for(
 
 def lone(places, **material):
     """Particles without neighbours: stencils do not overlap."""
-    position = torch.tensor(places, dtype=torch.float64)
+    position = double(places)
     given = {"volume": 1e-3, "density": 100.0, "youngs_modulus": 1e3, "poisson_ratio": 0.3}
     return MaterialPoints.create(position, **(given | material))
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from catalogue import BOUNDARIES, OBSTACLES, conditions, made
-from shared import without_waits
+from shared import double, without_waits
 from torch.testing import assert_close
 
 from gaussian_swaying import Box, Cylinder, MPMSolver, SimFrame, Sphere
@@ -18,9 +18,8 @@ from gaussian_swaying.geometry.regions import Everything, Not, Union
 from gaussian_swaying.mpm.boundary import Nodes
 from gaussian_swaying.mpm.colliders import Plane, VelocityBox, plane_velocity
 
-from .bodies import block, lone, march, run_for
+from .bodies import block, in_both, lone, march, near, run_for
 
-FORMULATIONS = ["total", "updated"]
 MOVING = KeyedPath([0.0, 0.2], [[0, 0, 0], [0.1, 0.05, 0]], [[0, 0, 0], [10, 20, 30]])
 UPPER = Box([None, None, 0.23], [None] * 3)
 REGIONS = {
@@ -76,7 +75,7 @@ def test_the_documented_boundaries_are_those_that_there_are():
     assert set(re.findall("`([A-Z][A-Za-z]+)`", row)) == set(BOUNDARIES)
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 @pytest.mark.parametrize(("kind", "friction"), [("sticky", 0.0), ("slip", 0.7), ("separate", 0.7)])
 def test_plane_and_box_leave_alone_what_is_near_but_free(formulation, kind, friction):
     """Less than 1.5 cells away and coming closer, yet no node at or behind the plane: a rigid flight."""
@@ -86,23 +85,23 @@ def test_plane_and_box_leave_alone_what_is_near_but_free(formulation, kind, fric
     ceiling = BOUNDARIES["Plane"]([0, 0, high], [0, 0, -1], kind, friction)
     for boundary in (plane, ceiling, BOUNDARIES["EnclosingBox"]([low] * 3, [high] * 3, kind, friction)):
         for sign in (1.0, -1.0):
-            velocity = sign * torch.tensor([0.3, -0.2, 0.25], dtype=torch.float64).expand_as(points.position)
+            velocity = sign * double([0.3, -0.2, 0.25]).expand_as(points.position)
             state = run_for(formulation, [boundary], points, 0.04, velocity, gravity=(0, 0, 0))
-            assert_close(state.velocity, velocity, rtol=0, atol=1e-12)
+            near(state.velocity, velocity, 1e-12)
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 @pytest.mark.parametrize("wall", [("Plane", [0, 0, 0.11], [0, 0, 1]), ("EnclosingBox", [-9, -9, 0.11], [9] * 3)])
 def test_separate_lets_go_of_what_moves_away_and_slip_does_not(formulation, wall):
     points = block(low=(0, 0, 0.05))  # behind the wall lie the lowest nodes of either formulation
-    velocity = torch.tensor([0.3, 0.0, 1.0], dtype=torch.float64).expand_as(points.position)
+    velocity = double([0.3, 0.0, 1.0]).expand_as(points.position)
 
     def run(kind, friction=0.0):
         boundary = made(*wall, kind, friction)()
         return run_for(formulation, [boundary], points, 0.02, velocity, gravity=(0, 0, 0)).velocity
 
-    assert_close(run("separate"), velocity, rtol=0, atol=1e-12)
-    assert_close(run("separate", 0.8), velocity, rtol=0, atol=1e-12)
+    near(run("separate"), velocity, 1e-12)
+    near(run("separate", 0.8), velocity, 1e-12)
     slip = run("slip")
     assert float(slip[:, 2].mean()) < 0.8
     assert float(slip[:, 0].mean()) == pytest.approx(0.3, rel=1e-9)
@@ -116,12 +115,12 @@ def test_a_substep_may_be_a_tensor_and_constants_are_made_once(name, monkeypatch
     for dtype, tolerance in ((torch.float32, 1e-6), (torch.float64, 1e-12)):
         boundary, velocity, nodes = _acting(name, "cpu", dtype)
         known = boundary(velocity, nodes)
-        found = boundary(velocity, dataclasses.replace(nodes, dt=torch.tensor(nodes.dt, dtype=torch.float64)))
+        found = boundary(velocity, dataclasses.replace(nodes, dt=double(nodes.dt)))
         assert found.dtype == dtype
         assert_close(found, known, rtol=tolerance, atol=0)
         assert not torch.equal(found, velocity)
     if name in ("handle", "impulse", "impulse for each"):  # values that depend on the substep
-        longer = boundary(velocity, dataclasses.replace(nodes, dt=torch.tensor(0.3, dtype=torch.float64)))
+        longer = boundary(velocity, dataclasses.replace(nodes, dt=double(0.3)))
         assert float((longer - known).abs().max()) > 1e-3
 
     for time, acts in ((0.499, True), (0.5, False)):
@@ -196,7 +195,7 @@ def test_in_frame_leaves_the_original_alone(name):
     assert all(torch.equal(value, values(boundary)[key]) for key, value in before.items())
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 @pytest.mark.parametrize("name", [name for name in NAMES if name not in ("points", "still")])
 def test_conditions_can_be_copied_saved_and_narrowed(name, formulation):
     """A deep copy and a copy from the state dict give the same bits; float32 gives the same to round-off."""
@@ -218,7 +217,7 @@ def test_conditions_can_be_copied_saved_and_narrowed(name, formulation):
     narrow = loaded.to(torch.float32)
     end = march(narrow, points.map(lambda t: t.float()), 2e-3, 6, None if push is None else push.float())[-1]
     assert end.position.dtype == torch.float32
-    assert_close(end.position.double(), known.position, rtol=0, atol=2e-6)
+    near(end.position.double(), known.position, 2e-6)
 
 
 @pytest.mark.parametrize("name", ["pin", "handle", "release", "front", "impulse", "impulse for each"])
@@ -283,7 +282,7 @@ def test_bad_boundaries_are_refused():
             BOUNDARIES[kind](*given, **settings)
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_pin_holds_only_its_end(formulation):
     points = block()
     pin = made("PinnedRegion", Box([None, None, 0.34], [None, None, None]))()
@@ -300,10 +299,10 @@ def test_pin_holds_only_its_end(formulation):
 def test_an_obstacle_stops_the_nodes_on_and_in_it_in_its_time(time, acts):
     """A ball of radius 2 without friction: what moves into it slides, from its surface inwards."""
     ball = BOUNDARIES["BallObstacle"]([1.0, 0.0, 0.0], 2.0, friction=0.0, start=0.5, end=1.0)
-    place = torch.tensor([[3.0, 0, 0], [2.0, 0, 0], [3.001, 0, 0], [-4.0, 0, 0]], dtype=torch.float64)
-    velocity = torch.tensor([[-1.0, 0.5, 0.0]], dtype=torch.float64).expand(4, 3)
-    found = ball(velocity, Nodes(torch.tensor(time, dtype=torch.float64), 1e-3, place))
-    stopped = torch.tensor([0.0, 0.5, 0.0], dtype=torch.float64)
+    place = double([[3.0, 0, 0], [2.0, 0, 0], [3.001, 0, 0], [-4.0, 0, 0]])
+    velocity = double([[-1.0, 0.5, 0.0]]).expand(4, 3)
+    found = ball(velocity, Nodes(double(time), 1e-3, place))
+    stopped = double([0.0, 0.5, 0.0])
     expected = torch.where(torch.tensor([[True], [True], [False], [False]]) & acts, stopped, velocity)
     assert_close(found, expected)
 
@@ -311,13 +310,13 @@ def test_an_obstacle_stops_the_nodes_on_and_in_it_in_its_time(time, acts):
 @pytest.mark.parametrize("path", [None, KeyedPath([0.0, 1.0], moves=[[0, 0, 0], [1, 2, 3]])])
 def test_a_mesh_in_a_frame_is_as_far_as_in_the_scene(path):
     """Turned, moved, and three metres per unit."""
-    turn = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
-    frame = SimFrame(torch.tensor([0.3, -0.1, 0.2], dtype=torch.float64), turn, 3.0)
+    turn = double([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    frame = SimFrame(double([0.3, -0.1, 0.2]), turn, 3.0)
     mesh = OBSTACLES["mesh"](path=path)
     low, high = mesh.corner, mesh.corner + mesh.spacing * (torch.tensor(mesh.values.shape) - 1)
     draw = torch.rand(200, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     place = low + draw * (high - low) + torch.tensor([0.113, 0.207, 0.181])
-    now = torch.tensor(0.0, dtype=torch.float64)
+    now = double(0.0)
     distance, normal, speed = mesh.touch(place, now, 0.1)
     found = mesh.in_frame(frame).touch(frame.point_to_sim(place), now, 0.1)
     assert float(distance.amin()) < -2 * mesh.spacing
@@ -330,12 +329,12 @@ def test_a_mesh_in_a_frame_is_as_far_as_in_the_scene(path):
 # ---- planes: contact, friction, and nothing on the free side
 
 
-UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+UP = double([0.0, 0.0, 1.0])
 
 
 def test_plane_velocity_kinds():
-    into = torch.tensor([[3.0, 0.0, -2.0]], dtype=torch.float64)
-    away = torch.tensor([[3.0, 0.0, 2.0]], dtype=torch.float64)
+    into = double([[3.0, 0.0, -2.0]])
+    away = double([[3.0, 0.0, 2.0]])
     assert plane_velocity(into, UP, "sticky", 0.0).tolist() == [[0, 0, 0]]
     assert plane_velocity(away, UP, "sticky", 0.0).tolist() == [[0, 0, 0]]
     assert plane_velocity(into, UP, "slip", 0.0).tolist() == [[3, 0, 0]]
@@ -351,10 +350,10 @@ def test_plane_velocity_kinds():
 @pytest.mark.parametrize("length", [1e-3, 1.0, 50.0])
 def test_the_length_of_the_normal_does_not_matter(length):
     plane = Plane([0.0, 0.0, 0.0], [0.6 * length, 0.0, -0.8 * length])
-    assert_close(plane.normal, torch.tensor([0.6, 0.0, -0.8], dtype=torch.float64))
+    assert_close(plane.normal, double([0.6, 0.0, -0.8]))
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_block_slides_down_an_incline_with_coulombs_acceleration(formulation):
     """Static below the friction angle; a = g (sin - mu cos) above. Gravity is tilted instead of the plane."""
     angle, points = math.radians(30), block()
@@ -377,7 +376,7 @@ def test_block_slides_down_an_incline_with_coulombs_acceleration(formulation):
 # ---- velocity boxes, at rest and travelling
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_velocity_box_drives_only_its_side(formulation):
     """Two lone particles on either side of a face: the nodes inside are driven, the others are not."""
     points = lone([[0.0, 0.0, 0.05], [0.0, 0.0, -0.25]])
@@ -386,22 +385,22 @@ def test_velocity_box_drives_only_its_side(formulation):
     speed = torch.stack([state.velocity for state in ends])
     assert float(speed[:, 1].abs().max()) == 0.0
     assert float(speed[:3, 0].abs().max()) == 0.0  # states 0 to 2 lie before the window
-    torch.testing.assert_close(speed[3, 0], torch.tensor([0.5, 0.0, -0.3], dtype=torch.float64))
+    torch.testing.assert_close(speed[3, 0], double([0.5, 0.0, -0.3]))
 
 
 def test_a_travelling_box_takes_its_nodes_from_where_it_is():
     """It moves from its start on, in the metres of a frame that scales and rotates; a fixed box does not move."""
     frame = SimFrame.fit(block().position, up=(0.0, 1.0, 0.0), metres_per_unit=0.5)
     box = Box([0.0, 0.0, 0.0], [0.2, 0.4, 0.4])
-    drift = frame.direction_to_sim(torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64))
+    drift = frame.direction_to_sim(double([1.0, 0.0, 0.0]))
     move = (0.3 * drift).tolist()
     boxes = [VelocityBox(box, move, start=0.1, end=9.0, travels=travels).in_frame(frame) for travels in (True, False)]
     place = torch.rand(500, 3, dtype=torch.float64) * torch.tensor([1.0, 0.6, 0.6])
     for time in (0.1, 0.4):
-        nodes = Nodes(torch.tensor(time, dtype=torch.float64), 1e-3, frame.point_to_sim(place))
+        nodes = Nodes(double(time), 1e-3, frame.point_to_sim(place))
         driven = [(b(torch.zeros_like(place), nodes) != 0).any(-1) for b in boxes]
         # 0.3 m/s are 0.6 scene units a second
-        gone = place - torch.tensor([0.6 * (time - 0.1), 0, 0], dtype=torch.float64)
+        gone = place - double([0.6 * (time - 0.1), 0, 0])
         assert torch.equal(driven[0], box.contains(gone))
         assert torch.equal(driven[1], box.contains(place))
         assert torch.equal(driven[0], driven[1]) == (time == 0.1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import curve_fit
-from shared import solid
+from shared import double, solid
 from torch.testing import assert_close
 
 from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedPoints, PinnedRegion
@@ -14,7 +14,8 @@ from gaussian_swaying.geometry.regions import Everything, Union
 from gaussian_swaying.mpm.colliders import HalfSpaceObstacle
 from gaussian_swaying.mpm.pins import Handle, RigidRegion
 
-FORMULATIONS = ["total", "updated"]
+from .bodies import in_both, near
+
 RIGHT = Box([0.2, None, None], [None] * 3)
 
 
@@ -46,7 +47,7 @@ def strain(F):
 @pytest.mark.parametrize(
     ("transfer", "dtype"), [("torch", torch.float64), ("kernels", torch.float64), ("kernels", torch.float32)], ids=str
 )
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_a_free_part_keeps_momenta_energy_and_shape(formulation, transfer, dtype):
     """It turns about no axis of its own, so that the axis of its rotation moves: 1,000 substeps, 1.4 turns.
 
@@ -73,12 +74,12 @@ def test_a_free_part_keeps_momenta_energy_and_shape(formulation, transfer, dtype
     assert float(solver.energies(state)["elastic"]) < 1e-12 * rounding
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_half_of_a_bar_pulls_at_the_other(formulation):
     """The rigid half keeps its shape, the soft half bends, both fly on with the momenta of both together."""
     points, solver = bar(RigidRegion(RIGHT), formulation=formulation, gravity=(0, 0, 0))
     own = right(points)
-    velocity = torch.where(own[:, None], torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), 0.0)
+    velocity = torch.where(own[:, None], double([0.0, 0.0, 1.0]), 0.0)
     state = solver.rollout(solver.init_state(points, velocity, margin=4), 1e-4, 1)
     before = solver.momenta(state)
     state = advance(solver, state, 0.2)
@@ -91,7 +92,7 @@ def test_half_of_a_bar_pulls_at_the_other(formulation):
     assert float(gap) < 0.05  # and does not tear off
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_a_part_next_to_a_held_one_stays(formulation):
     pin = PinnedRegion(Box([None] * 3, [0.1, None, None]), "nodes")
     points, solver = bar(RigidRegion(Box([0.1, None, None], [0.3, None, None])), pin, formulation=formulation)
@@ -109,17 +110,17 @@ def test_a_pin_of_no_kind_holds_the_nodes_of_a_rigid_part():
     assert float((state.position - points.position)[~right(points)].norm(dim=-1).max()) > 1e-2
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_a_handle_leads_the_whole_part(formulation):
     handle = Handle(Box([0.3, None, None], [None] * 3), angular_velocity=[0, 0, 2.0], pivot=[0.4, 0, 0], kind="nodes")
     points, solver = bar(RigidRegion(RIGHT), handle, formulation=formulation, gravity=(0, 0, 0))
     state = advance(solver, solver.init_state(points), 0.25)
     s, c = math.sin(0.5), math.cos(0.5)
-    turn = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1.0]], dtype=torch.float64)
-    pivot = torch.tensor([0.4, 0, 0], dtype=torch.float64)
+    turn = double([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+    pivot = double([0.4, 0, 0])
     wanted = pivot + (points.position - pivot) @ turn.mT
-    assert_close(state.position[right(points)], wanted[right(points)], rtol=0, atol=1e-5)
-    assert_close(state.F_total[right(points)], turn.expand(int(right(points).sum()), 3, 3), rtol=0, atol=1e-4)
+    near(state.position[right(points)], wanted[right(points)], 1e-5)
+    near(state.F_total[right(points)], turn.expand(int(right(points).sum()), 3, 3), 1e-4)
 
 
 def test_scenes_of_a_batch_do_not_know_each_other():
@@ -133,10 +134,10 @@ def test_scenes_of_a_batch_do_not_know_each_other():
         count = together.substeps(together.init_state(MaterialPoints.stack([points, other])), 0.1 / 3)
         for _ in range(3):
             begin = single.rollout(begin, 0.1 / 3 / count, count)
-        assert_close(state.position[k], begin.position, rtol=0, atol=1e-10)
+        near(state.position[k], begin.position, 1e-10)
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_it_has_gradients(formulation):
     """Of the height of the body by the stiffness of what it hangs on, against a difference."""
     pin = PinnedRegion(Box([None] * 3, [0.1, None, None]), "nodes")
@@ -162,7 +163,7 @@ def pendulum(dx):
     count = round(3 / dx)
     above, side = round(0.3 * count), round(6 * half / dx)
     down = -(torch.arange(-above, count, dtype=torch.float64) + 0.5) / count
-    across = torch.tensor([-1.0, 1.0], dtype=torch.float64) * width / 2 / 3**0.5
+    across = double([-1.0, 1.0]) * width / 2 / 3**0.5
     inside = ((torch.arange(side, dtype=torch.float64) + 0.5) / side * 2 - 1) * half
     cord, box = torch.cartesian_prod(across, across, down), torch.cartesian_prod(inside, inside, inside)
     place = torch.cat([cord, box + torch.tensor([0, 0, -1 - half])])
@@ -193,10 +194,8 @@ def pendulum(dx):
     # a double pendulum; the cord is clamped at both ends, as if it began the length sqrt(EI / T) farther in
     bent = math.sqrt(E * width**4 / 12 / (mass * 9.81))
     cord_length, arm = sum(lengths) / len(lengths) - half - 2 * bent, half + bent
-    inertia = mass * torch.tensor(
-        [[cord_length**2, cord_length * arm], [cord_length * arm, arm**2 + (2 * half) ** 2 / 6]], dtype=torch.float64
-    )
-    pull = mass * 9.81 * torch.diag(torch.tensor([cord_length, arm], dtype=torch.float64))
+    inertia = mass * double([[cord_length**2, cord_length * arm], [cord_length * arm, arm**2 + (2 * half) ** 2 / 6]])
+    pull = mass * 9.81 * torch.diag(double([cord_length, arm]))
     lowest = torch.linalg.eigvals(torch.linalg.solve(inertia, pull)).real.min()
     return 2 * math.pi / abs(rate), 2 * math.pi / float(lowest) ** 0.5
 
@@ -239,14 +238,14 @@ def test_in_updated_parts_may_meet():
     """Each keeps its shape; the grid between them passes momentum on."""
     left = Box([None] * 3, [0.2, None, None])
     points, solver = bar(RigidRegion(left), RigidRegion(RIGHT), formulation="updated", gravity=(0, 0, 0))
-    velocity = torch.where(right(points)[:, None], torch.tensor([-1.0, 0.0, 0.0], dtype=torch.float64), 0.0)
+    velocity = torch.where(right(points)[:, None], double([-1.0, 0.0, 0.0]), 0.0)
     state = solver.init_state(points, velocity, margin=4)
     before = solver.momenta(state)["linear"]
     state = advance(solver, state, 0.1)
     assert_close(solver.momenta(state)["linear"], before, rtol=1e-9, atol=1e-10)
     assert float(state.velocity[~right(points), 0].max()) < -0.3  # it is pushed
     for own in (right(points), ~right(points)):
-        assert_close(torch.pdist(state.position[own]), torch.pdist(points.position[own]), rtol=0, atol=1e-12)
+        near(torch.pdist(state.position[own]), torch.pdist(points.position[own]), 1e-12)
 
 
 def test_a_part_that_becomes_rigid_on_the_way_takes_its_shape_again():
@@ -259,4 +258,4 @@ def test_a_part_that_becomes_rigid_on_the_way_takes_its_shape_again():
     assert strain(after.F_total[right(points)]) < 1e-12
     distance = torch.pdist(points.position[right(points)])
     found = torch.pdist(after.position[right(points)])
-    assert_close(found, distance, rtol=0, atol=1e-12)
+    near(found, distance, 1e-12)
