@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gaussian_swaying import Force, MaterialPoints, MPMSolver
 from gaussian_swaying.kernels.language import tl, triton
-from gaussian_swaying.mpm.twins import Numbers, Twin
+from gaussian_swaying.mpm.device_functions import DeviceFunction, Numbers
 
 
 class PointVortex(Force):
@@ -31,14 +31,16 @@ class PointVortex(Force):
         """The circulation over two pi at times [s] of any shape."""
         return self.circulation / (2 * math.pi) * (1 + 0.5 * torch.sin(2 * math.pi * time / self.period))
 
-    def twin(self) -> Twin | None:
+    def device_function(self) -> DeviceFunction | None:
         """One number per point (zero where there is none), three for all, one per substep."""
 
         def turns(time: Tensor, dt: Tensor, steps: int) -> Tensor:
             return self.turn(time + dt * torch.arange(steps, dtype=torch.float64, device=time.device))[:, None]
 
         numbers = {"per_point": Numbers(1, lambda: self.drag), "numbers": Numbers(3, lambda: self.numbers)}
-        return Twin(circling_air, **numbers, per_substep=Numbers(1, turns), sources=(self.drag,), implicit=True)
+        return DeviceFunction(
+            circling_air, **numbers, per_substep=Numbers(1, turns), sources=(self.drag,), implicit=True
+        )
 
 
 @triton.jit

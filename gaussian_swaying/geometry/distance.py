@@ -1,7 +1,7 @@
 """Signed distances to solids and their unit gradients, as device functions: formulas, and values on a grid.
 
 Each gets a place, the numbers of the solid and its table, negative inside. They are those of obstacles, see
-``mpm.twins``.
+``mpm.device_functions``.
 """
 
 from __future__ import annotations

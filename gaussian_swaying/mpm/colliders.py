@@ -31,9 +31,9 @@ from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.geometry.rotations import rotation_of
 from gaussian_swaying.kernels.derive import on_tensors
 from gaussian_swaying.mpm.boundary import Boundary, Nodes
+from gaussian_swaying.mpm.device_functions import Composed, DeviceFunction, Numbers, Tables
 from gaussian_swaying.mpm.forces import MOST_STEPS
 from gaussian_swaying.mpm.touch import POSE, ROW, stopped
-from gaussian_swaying.mpm.twins import Composed, Numbers, Tables, Twin
 
 KINDS = ("sticky", "slip", "separate")
 
@@ -102,8 +102,8 @@ class Plane(Boundary):
         stopped = plane_velocity(velocity, self.normal, self.kind, self.friction)
         return torch.where((behind & self.active(nodes.time))[..., None], stopped, velocity)
 
-    def twin(self) -> Twin:
-        return Twin(half_space_distance, numbers=Numbers(3, lambda: self.normal), sources=(self,))
+    def device_function(self) -> DeviceFunction:
+        return DeviceFunction(half_space_distance, numbers=Numbers(3, lambda: self.normal), sources=(self,))
 
 
 class EnclosingBox(Boundary):
@@ -151,9 +151,9 @@ class EnclosingBox(Boundary):
             velocity = plane(velocity, nodes)
         return velocity
 
-    def twin(self) -> Twin:
+    def device_function(self) -> DeviceFunction:
         """Nothing but that of each plane."""
-        return Twin(None, parts=tuple(plane.twin() for plane in self.planes))  # type: ignore[operator]
+        return DeviceFunction(None, parts=tuple(plane.device_function() for plane in self.planes))  # type: ignore[operator]
 
 
 class VelocityBox(Boundary):
@@ -247,11 +247,11 @@ class Obstacle(Boundary):
         """``surface``: it acts on the surface where particles keep their neighbours, otherwise on ``nodes``."""
         return "surface" if neighbours_fixed else "nodes"
 
-    def solid(self) -> Twin:
+    def solid(self) -> DeviceFunction:
         """The device function of its distance at rest, and its numbers; a subclass has this or :meth:`distance`."""
         raise NotImplementedError(f"{type(self).__name__} has neither `solid` nor `distance`.")
 
-    def twin(self) -> Twin | None:
+    def device_function(self) -> DeviceFunction | None:
         return self.solid()
 
     def distance(self, place: Tensor) -> tuple[Tensor, Tensor]:
@@ -317,10 +317,12 @@ class Obstacle(Boundary):
         return torch.where(((distance <= 0) & self.active(nodes.time))[..., None], stopped, velocity)
 
 
-def grid_twin(obstacle: Obstacle, grid: DistanceGrid, axes: Tensor) -> Twin:
-    """The twin of an obstacle whose distances [m] are on a grid; its axes are columns."""
+def grid_device_function(obstacle: Obstacle, grid: DistanceGrid, axes: Tensor) -> DeviceFunction:
+    """The device function of an obstacle whose distances [m] are on a grid; its axes are columns."""
     table = Numbers(grid.values.numel(), lambda: grid.values)
-    return Twin(grid_distance, numbers=Numbers(16, lambda: grid.numbers(axes)), table=table, sources=(obstacle,))
+    return DeviceFunction(
+        grid_distance, numbers=Numbers(16, lambda: grid.numbers(axes)), table=table, sources=(obstacle,)
+    )
 
 
 class BallObstacle(Obstacle):
@@ -355,10 +357,10 @@ class BallObstacle(Obstacle):
         """The ball in metres, z up."""
         return self.in_metres(frame, radius=self.radius * frame.metres_per_unit)
 
-    twin = Obstacle.twin
+    device_function = Obstacle.device_function
 
-    def solid(self) -> Twin:
-        return Twin(ball_distance, numbers=Numbers(1, lambda: self.radius), sources=(self,))
+    def solid(self) -> DeviceFunction:
+        return DeviceFunction(ball_distance, numbers=Numbers(1, lambda: self.radius), sources=(self,))
 
 
 class BoxObstacle(Obstacle):
@@ -403,11 +405,11 @@ class BoxObstacle(Obstacle):
         axes = frame.direction_to_sim(self.axes.T.contiguous()).T.contiguous()
         return self.in_metres(frame, half_sides=self.half_sides * frame.metres_per_unit, axes=axes)
 
-    twin = Obstacle.twin
+    device_function = Obstacle.device_function
 
-    def solid(self) -> Twin:
+    def solid(self) -> DeviceFunction:
         numbers = Numbers(12, lambda: torch.cat([self.half_sides, self.axes.reshape(-1)]))
-        return Twin(box_distance, numbers=numbers, sources=(self,))
+        return DeviceFunction(box_distance, numbers=numbers, sources=(self,))
 
 
 class CapsuleObstacle(Obstacle):
@@ -450,15 +452,15 @@ class CapsuleObstacle(Obstacle):
         half = frame.direction_to_sim(self.half_axis) * frame.metres_per_unit
         return self.in_metres(frame, radius=self.radius * frame.metres_per_unit, half_axis=half)
 
-    twin = Obstacle.twin
+    device_function = Obstacle.device_function
 
-    def solid(self) -> Twin:
+    def solid(self) -> DeviceFunction:
         def numbers() -> Tensor:
             squared = self.half_axis.square().sum()
             inverse = torch.where(squared > 0, 1 / squared, 0.0)
             return torch.cat([self.radius[None], self.half_axis, inverse[None]])
 
-        return Twin(capsule_distance, numbers=Numbers(5, numbers), sources=(self,))
+        return DeviceFunction(capsule_distance, numbers=Numbers(5, numbers), sources=(self,))
 
 
 class HalfSpaceObstacle(Obstacle):
@@ -495,10 +497,10 @@ class HalfSpaceObstacle(Obstacle):
         """The half space in metres, z up."""
         return self.in_metres(frame, normal=frame.direction_to_sim(self.normal).clone())
 
-    twin = Obstacle.twin
+    device_function = Obstacle.device_function
 
-    def solid(self) -> Twin:
-        return Twin(half_space_distance, numbers=Numbers(3, lambda: self.normal), sources=(self,))
+    def solid(self) -> DeviceFunction:
+        return DeviceFunction(half_space_distance, numbers=Numbers(3, lambda: self.normal), sources=(self,))
 
 
 class MeshObstacle(Obstacle):
@@ -552,10 +554,10 @@ class MeshObstacle(Obstacle):
         moved = self.in_metres(frame, values=self.values * unit, corner=self.corner * unit, axes=axes)
         return changed(moved, spacing=self.spacing * unit)
 
-    twin = Obstacle.twin
+    device_function = Obstacle.device_function
 
-    def solid(self) -> Twin:
-        return grid_twin(self, DistanceGrid(self.values, self.corner, self.spacing), self.axes)
+    def solid(self) -> DeviceFunction:
+        return grid_device_function(self, DistanceGrid(self.values, self.corner, self.spacing), self.axes)
 
 
 class StillGaussians(Obstacle):
@@ -604,17 +606,17 @@ class StillGaussians(Obstacle):
         """Itself: it is in metres."""
         return copy.copy(self)
 
-    def solid(self) -> Twin:
+    def solid(self) -> DeviceFunction:
         """The interpolation of the grid; RuntimeError if none was set."""
         if self.spacing == 0:
             raise RuntimeError(
                 "The StillGaussians have no Gaussians: give them to a Simulation, which knows the scene."
             )
-        return grid_twin(
+        return grid_device_function(
             self, DistanceGrid(self.values, self.corner, self.spacing), torch.eye(3, device=self.corner.device)
         )
 
-    def twin(self) -> Twin | None:
+    def device_function(self) -> DeviceFunction | None:
         return None if self.spacing == 0 else self.solid()
 
 
@@ -622,14 +624,14 @@ Solid = Plane | Obstacle
 
 
 def solids_of(boundaries: Sequence[Boundary], pins: Container[int] = ()) -> list[tuple[Solid, int]] | None:
-    """All solids, each with the number of its boundary; None if a boundary has no twin.
+    """All solids, each with the number of its boundary; None if a boundary has no device function.
 
     Args:
         boundaries: The boundary conditions of a body.
         pins: Numbers of those that are no solids.
     """
     others = [(one, k) for k, one in enumerate(boundaries) if k not in pins]
-    if any(boundary.twin() is None for boundary, _ in others):
+    if any(boundary.device_function() is None for boundary, _ in others):
         return None
     return [(part, k) for one, k in others for part in one.modules() if isinstance(part, Solid)]
 
@@ -642,16 +644,16 @@ class Solids:
         like: A tensor of the type and device of the tables.
 
     Attributes:
-        twins: Their device functions.
+        device functions: Their device functions.
         kinds: For each, its kind of contact in :data:`KINDS`.
         moves: For each, whether it moves.
     """
 
     def __init__(self, parts: Sequence[tuple[Solid, int]], like: Tensor) -> None:
         self.parts, device = list(parts), like.device
-        count, found = len(self.parts), [part.twin() for part, _ in self.parts]
-        self._twins = [twin for twin in found if twin is not None]
-        self.twins, self.tables = Composed(self._twins), Tables(device, like.dtype)
+        count, found = len(self.parts), [part.device_function() for part, _ in self.parts]
+        self._device_functions = [device_function for device_function in found if device_function is not None]
+        self.device_functions, self.tables = Composed(self._device_functions), Tables(device, like.dtype)
         self.kinds = tuple(KINDS.index(part.kind if isinstance(part, Plane) else "separate") for part, _ in self.parts)
         self.moves = tuple(isinstance(part, Obstacle) and not part.still for part, _ in self.parts)
         self.rows = like.new_zeros(count, ROW.value)
@@ -660,7 +662,7 @@ class Solids:
 
     def take(self) -> None:
         """Fill the tables; again only if one of the solids was changed."""
-        if not self.tables.take(self._twins, self.twins, numbers=True):
+        if not self.tables.take(self._device_functions, self.device_functions, numbers=True):
             return
         for m, (part, boundary) in enumerate(self.parts):
             gap, center = (0.0, part.point) if isinstance(part, Plane) else (part.gap, part.center)

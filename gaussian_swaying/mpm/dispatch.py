@@ -17,9 +17,9 @@ from torch import Tensor
 from gaussian_swaying.geometry.linalg_triton import matmul, scaled_product, svd3, transpose, where3, where9
 from gaussian_swaying.kernels.derive import device_function, on_tensors
 from gaussian_swaying.kernels.language import tl, triton
+from gaussian_swaying.mpm.device_functions import device_key
 from gaussian_swaying.mpm.laws.law import NUMBERS, ConstitutiveLaw, DeviceLaw, lame_parameters
 from gaussian_swaying.mpm.state import MaterialPoints
-from gaussian_swaying.mpm.twins import device_key
 
 ROW = tl.constexpr(2 + NUMBERS)  # columns of the table: which stress, which flow (-1 for none), the numbers
 

@@ -12,11 +12,11 @@ from gaussian_swaying._checks import check_like, check_shape
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.kernels.derive import Memory, on_tensors
 from gaussian_swaying.kernels.graphs import Recordable, tensors_in
+from gaussian_swaying.mpm.device_functions import Compilable, Composed, DeviceFunction
 from gaussian_swaying.mpm.state import State
-from gaussian_swaying.mpm.twins import Composed, Twin, Twinned
 
 MOST_STEPS = 256
-"""Largest number of substeps for which the numbers of a twin are taken at once."""
+"""Largest number of substeps for which the numbers of a device function are taken at once."""
 
 Given = Tensor | tuple[Tensor, Tensor | None]
 """A force [N], shape (..., P, 3), alone or with its resistance [kg/s], shape (..., P)."""
@@ -24,11 +24,11 @@ Given = Tensor | tuple[Tensor, Tensor | None]
 ForceFunction = Callable[[State], Given]
 
 
-class Force(Recordable, Twinned, nn.Module):
+class Force(Recordable, Compilable, nn.Module):
     """Base class of all forces: computes the force on every particle from the state, in torch.
 
-    A custom force is a subclass with a ``forward`` in torch, or with a ``twin``, one device function, which also runs
-    inside the kernels of the substep (:mod:`~gaussian_swaying.mpm.twins`). It may have numbers, tensors
+    A custom force is a subclass with a ``forward`` in torch, or with a ``device_function``, which also runs inside the
+    kernels of the substep (:mod:`~gaussian_swaying.mpm.device_functions`). It may have numbers, tensors
     (``register_buffer``) and parameters; they receive gradients. Move it to the device of the material, like any
     module.
 
@@ -48,7 +48,7 @@ class Force(Recordable, Twinned, nn.Module):
     """
 
     def forward(self, state: State) -> Given:
-        """The force at the start of a substep: that of the twin, also of a subclass that has none of its own.
+        """The force at the start of a substep: that of the nearest device function of the class and its bases.
 
         Args:
             state: The state at that time.
@@ -58,10 +58,10 @@ class Force(Recordable, Twinned, nn.Module):
             gained in the substep [kg/s], shape (..., P). A force with a resistance acts at the velocity at the end of
             the substep, so it is stable for particles of any mass.
         """
-        twin = self.nearest_twin()
-        if twin is None:
-            raise NotImplementedError(f"{type(self).__name__} needs a `forward(state)` or a `twin`.")
-        return of_twin(twin, state)
+        device_function = self.nearest_device_function()
+        if device_function is None:
+            raise NotImplementedError(f"{type(self).__name__} needs a `forward(state)` or a `device_function`.")
+        return computed(device_function, state)
 
     def in_frame(self, frame: SimFrame) -> Force:
         """The same force with its positions converted from scene units to metres, z up; itself if it has none.
@@ -98,21 +98,25 @@ class Force(Recordable, Twinned, nn.Module):
         return None
 
 
-def of_twin(twin: Twin, state: State) -> Given:
+def computed(device_function: DeviceFunction, state: State) -> Given:
     """The device function of a force on tensors, as :meth:`Force.forward`."""
     like = state.position
 
     def scalars(given: Any) -> tuple[Tensor, ...]:
         return torch.as_tensor(given).to(like).unbind(-1)
 
-    now = twin.per_substep.take(state.time, torch.zeros_like(state.time), 1)[0] if twin.per_substep.count else ()
-    point, numbers = (scalars(values.take()) for values in (twin.per_point, twin.numbers))
-    F, table = state.F_total.flatten(-2).unbind(-1), Memory(torch.as_tensor(twin.table.take()).to(like))
-    options = (*twin.options, Composed(twin.parts))
+    now = (
+        device_function.per_substep.take(state.time, torch.zeros_like(state.time), 1)[0]
+        if device_function.per_substep.count
+        else ()
+    )
+    point, numbers = (scalars(values.take()) for values in (device_function.per_point, device_function.numbers))
+    F, table = state.F_total.flatten(-2).unbind(-1), Memory(torch.as_tensor(device_function.table.take()).to(like))
+    options = (*device_function.options, Composed(device_function.parts))
     given = (F, state.velocity.unbind(-1), like.unbind(-1), point, numbers, scalars(now), table, options)
-    force, resistance = on_tensors(twin.function)(*given)
+    force, resistance = on_tensors(device_function.function)(*given)
     value = torch.stack([part.expand(like.shape[:-1]) for part in force], -1)
-    return (value, resistance.expand(like.shape[:-1])) if twin.implicit else value
+    return (value, resistance.expand(like.shape[:-1])) if device_function.implicit else value
 
 
 class FunctionForce(Force):
@@ -181,9 +185,13 @@ def tensors_of(forces: Sequence[Force]) -> list[Tensor]:
     return tensors_in(forces)
 
 
-def divide(forces: Sequence[Force]) -> tuple[tuple[Force, ...], list[Twin], tuple[Force, ...]]:
-    """The forces that have a twin, their twins, and the others, which run in torch."""
-    twins = [force.twin() for force in forces]
-    fused = tuple(force for force, twin in zip(forces, twins, strict=True) if twin is not None)
-    asked = tuple(force for force, twin in zip(forces, twins, strict=True) if twin is None)
-    return fused, [twin for twin in twins if twin is not None], asked
+def divide(forces: Sequence[Force]) -> tuple[tuple[Force, ...], list[DeviceFunction], tuple[Force, ...]]:
+    """The forces that have a device function, their device functions, and the others, which run in torch."""
+    device_functions = [force.device_function() for force in forces]
+    fused = tuple(
+        force for force, device_function in zip(forces, device_functions, strict=True) if device_function is not None
+    )
+    asked = tuple(
+        force for force, device_function in zip(forces, device_functions, strict=True) if device_function is None
+    )
+    return fused, [device_function for device_function in device_functions if device_function is not None], asked

@@ -28,6 +28,7 @@ from gaussian_swaying.kernels.launch import lanes, launch, replaces
 from gaussian_swaying.mpm.boundary import Boundary
 from gaussian_swaying.mpm.contact import Surface
 from gaussian_swaying.mpm.damping import decay_rate
+from gaussian_swaying.mpm.device_functions import DeviceFunction, Loads
 from gaussian_swaying.mpm.forces import Force, added, split, tensors_of
 from gaussian_swaying.mpm.formulation import Settings, flowing
 from gaussian_swaying.mpm.modal import Analysis, analysis_of
@@ -35,7 +36,6 @@ from gaussian_swaying.mpm.pins import PinnedPoints, PinnedRegion, RigidRegion
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState, State
 from gaussian_swaying.mpm.total import Total
 from gaussian_swaying.mpm.transfer import gather, scatter
-from gaussian_swaying.mpm.twins import Loads, Twin
 
 MOST_LEAN = 0.4  # over the longest side, that modes can show
 MOST_MODES = 80
@@ -202,9 +202,9 @@ class Modes(Total):
 
     def _kernel(self, state: MPMState, groups: Sequence[Force | None], time: Tensor, dt: float, steps: int) -> Any:
         """The kernel of the forces on the sites, with their numbers; None where torch computes them."""
-        twins = [force.twin() for force in groups if force is not None]
+        device_functions = [force.device_function() for force in groups if force is not None]
         given = [state.position, *tensors_of([force for force in groups if force is not None]), *self.tensors()]
-        if not twins or None in twins or not replaces((state.position,)):
+        if not device_functions or None in device_functions or not replaces((state.position,)):
             return None
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (*state.tensors(), *given)):
             return None
@@ -212,7 +212,7 @@ class Modes(Total):
             with torch.inference_mode(False):
                 self._site_forces = SiteForces(self.site_rest)
         with torch.inference_mode(False), torch.no_grad():
-            self._site_forces.prepare(twins, time, dt, steps)
+            self._site_forces.prepare(device_functions, time, dt, steps)
         return self._site_forces
 
     def _site_state(self, moved: Tensor, time: Tensor) -> State:
@@ -498,16 +498,16 @@ class SiteForces:
         self.loads = Loads(rest.shape[:-1], {"dtype": rest.dtype, "device": rest.device})
         self.values = rest.new_zeros(1)
 
-    def prepare(self, twins: Sequence[Twin], time: Tensor, dt: float, steps: int) -> None:
+    def prepare(self, forces: Sequence[DeviceFunction], time: Tensor, dt: float, steps: int) -> None:
         """Take the numbers of the forces for some substeps.
 
         Args:
-            twins: Those of forces on sites.
+            forces: Those on sites.
             time: Time at which the first one acts [s], scalar float64 tensor.
             dt: Substep [s].
             steps: Number of substeps.
         """
-        values = self.loads.take(twins, steps)
+        values = self.loads.take(forces, steps)
         if values is not None:
             self.values = values.to(self.rest).T.contiguous()
         self.loads.begin(time, torch.full_like(time, dt), steps)

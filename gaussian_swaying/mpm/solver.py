@@ -324,7 +324,7 @@ class MPMSolver(Fixed, Solver):
     def _replays(self, state: MPMState, forces: Sequence[Force]) -> bool:
         """True if kernels run whole rollouts: no gradient is wanted, and the host need not call a force."""
         wanted = self.has_kernels and self._wanted(*state.tensors(), *tensors_of(forces))
-        return self.has_kernels and not wanted and all(f.recordable or f.twin() is not None for f in forces)
+        return self.has_kernels and not wanted and all(f.recordable or f.device_function() is not None for f in forces)
 
     def _kernels(self) -> Fused:
         if self._fused is None:
@@ -493,9 +493,9 @@ class MPMSolver(Fixed, Solver):
     ) -> MPMState:
         """Advance by several substeps.
 
-        With the kernels, substeps and forces are replayed from recordings: forces that have a twin run inside the
-        kernels, the others run in torch. If one of these others is not ``recordable`` (plain
-        functions are not), the host runs the substeps one by one and calls every force.
+        With the kernels, substeps and forces are replayed from recordings: forces with a device function run inside the
+        kernels, the others in torch. If one of these others is not ``recordable`` (plain functions are not), the host
+        runs the substeps one by one and calls every force.
 
         Args:
             state: The state now.

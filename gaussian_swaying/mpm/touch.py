@@ -1,9 +1,9 @@
 """Planes and obstacles as device functions.
 
-:class:`~gaussian_swaying.mpm.colliders.Solids` makes what they read: the numbers and tables of the twins; for each
-solid a row of :data:`ROW` numbers, gap, friction and the number of its boundary; and its time window. The pose of a
-substep has :data:`POSE` numbers: place of the centre (3), rotation (9), and the velocity of what is at an offset from
-the centre: a matrix (9) and the velocity of the centre (3).
+:class:`~gaussian_swaying.mpm.colliders.Solids` makes what they read: their numbers and tables; for each solid a row of
+:data:`ROW` numbers, gap, friction and the number of its boundary; and its time window. The pose of a substep has
+:data:`POSE` numbers: place of the centre (3), rotation (9), and the velocity of what is at an offset from the centre: a
+matrix (9) and the velocity of the centre (3).
 """
 
 from gaussian_swaying.geometry.linalg_triton import add3, dot3, matvec, read, transpose

@@ -29,11 +29,11 @@ from gaussian_swaying.geometry.distance import DistanceGrid
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.kernels.graphs import Replayed
+from gaussian_swaying.mpm.device_functions import DeviceFunction, Numbers
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.mpm.timestep import look_marks
-from gaussian_swaying.mpm.twins import Numbers, Twin
 from gaussian_swaying.wind.effects import Obstacle
 from gaussian_swaying.wind.field import WindField
 from gaussian_swaying.wind.force import WindForce, air_push
@@ -162,8 +162,8 @@ class AirPush(Force):
         way = way - dt * faster
         return substeps * dt * self.numbers[:, :3] - self.numbers[:, 3:] * way
 
-    def twin(self) -> Twin:
-        return Twin(air_push, per_point=Numbers(4, lambda: self.numbers), sources=(self.numbers,))
+    def device_function(self) -> DeviceFunction:
+        return DeviceFunction(air_push, per_point=Numbers(4, lambda: self.numbers), sources=(self.numbers,))
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from gaussian_swaying.geometry.linalg_triton import add3, chosen, cross3, dot3, 
 from gaussian_swaying.kernels.derive import Memory, on_tensors
 from gaussian_swaying.kernels.graphs import Recordable
 from gaussian_swaying.kernels.language import tl, triton
-from gaussian_swaying.mpm.twins import Numbers, Twin, Twinned
+from gaussian_swaying.mpm.device_functions import Compilable, DeviceFunction, Numbers
 
 SPREAD = 58.0
 """The updraft of a plume falls off as exp(-SPREAD r^2 / z^2)."""
@@ -64,11 +64,11 @@ def plume(v, x, numbers, now, table, OPTIONS: tl.constexpr):
 
 @dataclass(frozen=True)
 class Moment:
-    """The wind at one time, as the effects get it; their twins get n times at once.
+    """The wind at one time, as the effects get it; their device functions get n times at once.
 
     Attributes:
-        time: The time [s], scalar float64 tensor; of a twin, shape (n,).
-        flow: Flow without modulations and effects [m/s], shape (3,), float64; of a twin, (n, 3).
+        time: The time [s], scalar float64 tensor; of a device function, shape (n,).
+        flow: Flow without modulations and effects [m/s], shape (3,), float64; of a device function, (n, 3).
         carried: Displacement of the air by that flow since time zero [m]; likewise.
     """
 
@@ -77,17 +77,17 @@ class Moment:
     carried: Tensor
 
 
-class WindEffect(Recordable, Twinned, nn.Module):
+class WindEffect(Recordable, Compilable, nn.Module):
     """Base of effects, which change the wind from place to place.
 
-    A subclass has a ``twin``, one device function (:mod:`~gaussian_swaying.mpm.twins`), or else a ``forward`` in torch,
-    with ``recordable = True`` if that can be recorded in a CUDA graph (see ``Force``). If all effects of a wind have a
-    twin, kernels compute it. Places are in metres, z up, from the centre of the object at rest; in a configuration they
-    are in scene units, and :meth:`in_frame` converts them.
+    A subclass has a ``device_function`` (:mod:`~gaussian_swaying.mpm.device_functions`), or else a ``forward`` in
+    torch, with ``recordable = True`` if that can be recorded in a CUDA graph (see ``Force``). If all effects of a wind
+    have a device function, kernels compute it. Places are in metres, z up, from the centre of the object at rest; in a
+    configuration they are in scene units, and :meth:`in_frame` converts them.
     """
 
     def forward(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
-        """Return the changed velocity: that of the twin, also of a subclass that has none of its own.
+        """Return the changed velocity: that of the device function, also of a subclass that has none of its own.
 
         Args:
             velocity: Air velocity so far [m/s], broadcastable to (..., P, 3).
@@ -97,12 +97,12 @@ class WindEffect(Recordable, Twinned, nn.Module):
         Returns:
             Velocity [m/s], broadcastable to (..., P, 3).
         """
-        twin = self.nearest_twin()
-        if twin is None:
+        device_function = self.nearest_device_function()
+        if device_function is None:
             raise NotImplementedError(
-                f"{type(self).__name__} needs a `forward(velocity, position, moment)` or a `twin`."
+                f"{type(self).__name__} needs a `forward(velocity, position, moment)` or a `device_function`."
             )
-        return blown(twin, velocity, position, moment)
+        return blown(device_function, velocity, position, moment)
 
     def in_frame(self, frame: SimFrame) -> WindEffect:
         """The same effect with its places converted from scene units to metres, z up; itself if it has none."""
@@ -113,17 +113,19 @@ class WindEffect(Recordable, Twinned, nn.Module):
         return self
 
 
-def blown(twin: Twin, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
+def blown(device_function: DeviceFunction, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
     """The device function of an effect on tensors, as :meth:`WindEffect.forward`."""
 
     def numbers(given: Any) -> tuple[Any, ...]:
         return tuple(given.to(position).reshape(-1).unbind()) if isinstance(given, Tensor) else tuple(given)
 
     once = Moment(moment.time[None], moment.flow[None], moment.carried[None])
-    now = twin.per_substep.take(once) if twin.per_substep.count else ()
-    table = Memory(twin.table.take()) if twin.table.count else None
+    now = device_function.per_substep.take(once) if device_function.per_substep.count else ()
+    table = Memory(device_function.table.take()) if device_function.table.count else None
     air, place = velocity.to(position).unbind(-1), position.unbind(-1)
-    found = on_tensors(twin.function)(air, place, numbers(twin.numbers.take()), numbers(now), table, twin.options)
+    found = on_tensors(device_function.function)(
+        air, place, numbers(device_function.numbers.take()), numbers(now), table, device_function.options
+    )
     return torch.stack(torch.broadcast_tensors(*found), dim=-1)
 
 
@@ -174,9 +176,11 @@ class LogProfile(Profile):
             raise ValueError(f"Expected `roughness` ({roughness} m) to be below `height` ({height} m): lower it.")
         self.roughness = float(roughness)
 
-    def twin(self) -> Twin:
+    def device_function(self) -> DeviceFunction:
         scale = 1 / math.log(self.height / self.roughness)
-        return Twin(log_profile, numbers=Numbers(3, lambda: [self.ground[2], self.roughness, scale]), sources=(self,))
+        return DeviceFunction(
+            log_profile, numbers=Numbers(3, lambda: [self.ground[2], self.roughness, scale]), sources=(self,)
+        )
 
 
 class PowerProfile(Profile):
@@ -194,9 +198,9 @@ class PowerProfile(Profile):
         check_positive("exponent", exponent)
         self.exponent = float(exponent)
 
-    def twin(self) -> Twin:
+    def device_function(self) -> DeviceFunction:
         numbers = Numbers(3, lambda: [self.ground[2], 1 / self.height, self.exponent])
-        return Twin(power_profile, numbers=numbers, sources=(self,))
+        return DeviceFunction(power_profile, numbers=numbers, sources=(self,))
 
 
 class Plume(WindEffect):
@@ -242,9 +246,9 @@ class Plume(WindEffect):
         """The source in metres."""
         return changed(self, source=placed(frame, self.source), radius=self.radius * frame.metres_per_unit)
 
-    def twin(self) -> Twin:
+    def device_function(self) -> DeviceFunction:
         numbers = Numbers(6, lambda: [*self.source, math.sqrt(SPREAD) * self.radius, self.speed, SPREAD])
-        return Twin(plume, numbers=numbers, sources=(self,))
+        return DeviceFunction(plume, numbers=numbers, sources=(self,))
 
 
 PLANE_GROWTH = tl.constexpr(0.29 / math.sqrt(2 * math.log(2)))
@@ -497,8 +501,8 @@ class CylinderObstacle(Obstacle):
             raise ValueError("Expected `axis` to have a direction, but it is zero.")
         self.axis = [part / length for part in axis]
 
-    def twin(self) -> Twin:
-        return Twin(
+    def device_function(self) -> DeviceFunction:
+        return DeviceFunction(
             past_cylinder,
             options=(self.drag > 0,),
             numbers=Numbers(8, lambda: [*self.center, *self.axis, self.radius, self.drag]),
@@ -533,18 +537,23 @@ class EllipsoidObstacle(Obstacle):
         self.axes = [[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]]
 
     def forward(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
-        return blown(self._twin(12, 9) if position.dtype == torch.float64 else self.twin(), velocity, position, moment)
+        return blown(
+            self._device_function(12, 9) if position.dtype == torch.float64 else self.device_function(),
+            velocity,
+            position,
+            moment,
+        )
 
-    def twin(self) -> Twin:
-        return self._twin(7, 5)  # from two thirds of the distance to the root, to float32
+    def device_function(self) -> DeviceFunction:
+        return self._device_function(7, 5)  # from two thirds of the distance to the root, to float32
 
-    def _twin(self, newton: int, duplications: int) -> Twin:
+    def _device_function(self, newton: int, duplications: int) -> DeviceFunction:
         def numbers() -> list[float]:
             size = max(self.radii)
             shape = [*(radius / size for radius in self.radii), *ellipsoid_strength(tuple(self.radii))]
             return [*self.center, *chain(*self.axes), size, self.drag, wake_start(self.drag), *shape]
 
-        return Twin(
+        return DeviceFunction(
             past_ellipsoid,
             options=(self.drag > 0, newton, duplications),
             numbers=Numbers(21, numbers),

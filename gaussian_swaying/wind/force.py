@@ -43,9 +43,9 @@ from gaussian_swaying.geometry.patches import components, deformed_patch
 from gaussian_swaying.kernels.derive import device_function, gradient, on_tensors, primitive
 from gaussian_swaying.kernels.graphs import tensors_in
 from gaussian_swaying.kernels.language import tl, triton
+from gaussian_swaying.mpm.device_functions import DeviceFunction, Numbers
 from gaussian_swaying.mpm.forces import Force, Given
 from gaussian_swaying.mpm.state import MaterialPoints, State
-from gaussian_swaying.mpm.twins import Numbers, Twin
 from gaussian_swaying.wind.effects import Moment
 from gaussian_swaying.wind.field import SpatialWind, WindField
 from gaussian_swaying.wind.patches import Patches, PatchSums
@@ -265,7 +265,7 @@ def wind_force(F, velocity, position, point, numbers, now, table, OPTIONS: tl.co
 
 @cache
 def force_adjoint(groups: bool, law: int) -> Any:
-    """The gradients of a . f of a force by F, velocity, wind and coefficients, as ``Twin.adjoint``.
+    """The gradients of a . f of a force by F, velocity, wind and coefficients, as ``DeviceFunction.adjoint``.
 
     Args:
         groups: Whether it is that of :func:`force_on_group`, or else of :func:`force_on_patch`.
@@ -580,9 +580,9 @@ class AirLift(Force):
         """Potential energy of the force [J], shape (...) over the batch, float64."""
         return -(in_double(self.force) * in_double(state.position)).sum((-2, -1))
 
-    def twin(self) -> Twin | None:
+    def device_function(self) -> DeviceFunction | None:
         numbers = Numbers(4, lambda: torch.nn.functional.pad(self.force, (0, 1)))
-        return Twin(air_push, per_point=numbers, sources=(self.force,))
+        return DeviceFunction(air_push, per_point=numbers, sources=(self.force,))
 
 
 Wind = WindField | SpatialWind
@@ -609,8 +609,8 @@ class Places(nn.Module):
 class WindForce(Force):
     """Wind on surface patches that deform with their particles.
 
-    Pass it to ``MPMSolver.rollout`` as one of its ``forces``. A uniform wind has a Triton twin, so on a GPU the force
-    is computed inside the kernels of the substep.
+    Pass it to ``MPMSolver.rollout`` as one of its ``forces``. A uniform wind has a device function, so kernels of the
+    substep compute the force.
 
     Args:
         aero: Coefficients and law of the force.
@@ -840,16 +840,16 @@ class WindForce(Force):
         area = sums.area.reshape(*site.shape[:-1], count)
         return changed(self, aero=aero, sums=sums, area=area, normal=area.new_zeros(*area.shape, 3))
 
-    def twin(self) -> Twin | None:
-        """See :class:`~gaussian_swaying.mpm.twins.Twin`; None if an effect has none, or the lists are too long."""
+    def device_function(self) -> DeviceFunction | None:
+        """None if an effect has none, or the lists of patches are too long."""
         wind, aero, sums = self._fields[0], self.aero, self.sums
         if sums is not None and sums.rows >= 2**24:  # rows are counted in float32
             return None
-        parts: tuple[Twin, ...] = ()
+        parts: tuple[DeviceFunction, ...] = ()
         if not self.uniform:
             if not (self._shared and type(wind) is WindField):
                 return None
-            found = [effect.twin() for effect in wind.effects]  # type: ignore[operator]
+            found = [effect.device_function() for effect in wind.effects]  # type: ignore[operator]
             parts = tuple(part for part in found if part is not None)
             if len(parts) < len(found):
                 return None
@@ -864,7 +864,7 @@ class WindForce(Force):
                 Numbers(4 * sums.rows, sums.table),
             )
             patches = {"per_point": point, "table": table, "sources": (sums.tensor, sums.vector)}
-        return Twin(
+        return DeviceFunction(
             wind_force,
             options=(law, implicit, groups),
             numbers=Numbers(5, aero.numbers),
@@ -875,8 +875,8 @@ class WindForce(Force):
             **patches,
         )
 
-    def _with_effects(self, parts: Sequence[Twin], time: Tensor, dt: float | Tensor, steps: int) -> Tensor:
-        """As :meth:`winds`, and the numbers of the twins of the effects at these times, shape (steps, n)."""
+    def _with_effects(self, parts: Sequence[DeviceFunction], time: Tensor, dt: float | Tensor, steps: int) -> Tensor:
+        """As :meth:`winds`, and the numbers of the device functions of the effects at these times, shape (steps, n)."""
         wind = self._fields[0]
         assert isinstance(wind, WindField)
         times = time + torch.arange(steps, dtype=torch.float64, device=time.device) * dt

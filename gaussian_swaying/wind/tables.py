@@ -19,7 +19,7 @@ from gaussian_swaying._fixed import changed
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.linalg_triton import add3, chosen, matvec, scale3
 from gaussian_swaying.kernels.language import tl, triton
-from gaussian_swaying.mpm.twins import Numbers, Twin
+from gaussian_swaying.mpm.device_functions import DeviceFunction, Numbers
 from gaussian_swaying.wind.effects import Moment, WindEffect, placed
 from gaussian_swaying.wind.wind_files import read_bts, read_grid
 
@@ -160,13 +160,13 @@ class Tabulated(WindEffect):
     def now(self, moment: Moment) -> Tensor:
         """The numbers of n times, see :func:`tabulated`: shape (n, 4), or (n, 7) with a table for each time."""
 
-    def twin(self) -> Twin:
+    def device_function(self) -> DeviceFunction:
         timed = self.table.ndim > 4
 
         def numbers() -> Tensor:
             return torch.cat([(self.axes / self.step[:, None]).reshape(-1), self.axes.T.reshape(-1), self.sizes])
 
-        return Twin(
+        return DeviceFunction(
             tabulated,
             options=(*map(bool, self.wraps), self.table.shape[-1], timed),
             numbers=Numbers(21, numbers),
@@ -254,7 +254,7 @@ class CarriedField(Tabulated):
         """Factor of the velocities in a mean flow [m/s], shape (n, 3); shape (n, 1), or one number."""
         return self.scale
 
-    twin = Tabulated.twin
+    device_function = Tabulated.device_function
 
 
 class FrozenWind(CarriedField):
@@ -276,7 +276,7 @@ class FrozenWind(CarriedField):
         ValueError: If the file does not fit, or the flow is not that of a .bts.
     """
 
-    twin = Tabulated.twin
+    device_function = Tabulated.device_function
 
     def __init__(
         self, path: str | os.PathLike[str], origin: Sequence[float] = (0.0, 0.0, 0.0), scale: float = 1.0
@@ -334,7 +334,7 @@ class RecordedWind(Tabulated):
         ValueError: If the file does not fit.
     """
 
-    twin = Tabulated.twin
+    device_function = Tabulated.device_function
 
     def __init__(
         self,
@@ -436,7 +436,7 @@ class Shelter(Tabulated):
         strength: Factor of the drag area, for example for leaves that the splat does not show.
     """
 
-    twin = Tabulated.twin
+    device_function = Tabulated.device_function
 
     def __init__(self, cells: int = 32, strength: float = 1.0) -> None:
         if isinstance(cells, bool) or not isinstance(cells, int) or not 4 <= cells <= 256:

@@ -288,7 +288,7 @@ class Turbulence(CarriedField):
         torch.Size([32, 16, 16, 3])
     """
 
-    twin = Tabulated.twin
+    device_function = Tabulated.device_function
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""A custom force, from outside the package: examples/custom_force.py, with a twin for the kernels."""
+"""A custom force, from outside the package: examples/custom_force.py, with a device function for the kernels."""
 
 import importlib
 import sys
@@ -19,7 +19,7 @@ def module(monkeypatch):
 
 
 def test_the_example_ends_in_a_check(module, capsys):
-    """Its twin against torch, and its circulation."""
+    """Its device function against torch, and its circulation."""
     error, apart = module.main()
     assert error < 2e-5
     assert 0 < apart < 2e-5
@@ -28,7 +28,7 @@ def test_the_example_ends_in_a_check(module, capsys):
 
 def test_a_wrong_force_is_found(module):
     class Wrong(module.PointVortex):
-        twin = module.PointVortex.twin
+        device_function = module.PointVortex.device_function
 
         def forward(self, state):
             force, drag = super().forward(state)

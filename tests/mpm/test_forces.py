@@ -173,7 +173,7 @@ def test_a_wind_may_depend_on_the_place(formulation):
         solver.rollout(start, DT, 3, same).velocity, solver.rollout(start, DT, 3, wind).velocity, rtol=0, atol=1e-13
     )
     shear = WindForce(wind.aero, Shear(), wind.normal, wind.area)
-    assert shear.twin() is None
+    assert shear.device_function() is None
     assert shear.recordable
     assert not same.recordable
     state = start

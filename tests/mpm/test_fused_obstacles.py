@@ -33,7 +33,8 @@ def _ask_kernel(obstacle, place, time, device):
     launch(kernels.obstacle_places, (-(-count // block),))(
         place, torch.zeros(count, 4, device=device), torch.full_like(gap, 0.02), gap, facing, drive, valid, within,
         count, solids.rows, solids.windows, solids.poses, solids.tables.buffer, time, torch.full_like(time, DT), 0.01,
-        torch.zeros(1, dtype=torch.int32, device=device), 0, SOLIDS=solids.twins, MOVES=solids.moves[0], BLOCK=block,
+        torch.zeros(1, dtype=torch.int32, device=device), 0,
+        SOLIDS=solids.device_functions, MOVES=solids.moves[0], BLOCK=block,
     )  # fmt: skip
     return gap, facing, drive, valid, int(within)
 

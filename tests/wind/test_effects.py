@@ -86,7 +86,11 @@ def test_the_documented_effects_are_those_that_there_are():
     names = set()
     for found in iter_modules(wind.__path__):
         for kind in vars(import_module(f"{wind.__name__}.{found.name}")).values():
-            known = isinstance(kind, type) and issubclass(kind, WindEffect) and kind.twin is not WindEffect.twin
+            known = (
+                isinstance(kind, type)
+                and issubclass(kind, WindEffect)
+                and kind.device_function is not WindEffect.device_function
+            )
             names |= {kind.__name__} - {"CarriedField", "Tabulated"} if known else set()
     docs = Path(__file__).parents[2] / "docs"
     (row,) = (line for line in (docs / "configuration.md").read_text().splitlines() if "`wind.effects`" in line)

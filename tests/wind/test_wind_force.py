@@ -14,7 +14,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from gaussian_swaying import AeroForce, MPMSolver, SpatialWind, UniformGust, WindField, WindForce
 from gaussian_swaying._fixed import assign, changed
 from gaussian_swaying.geometry.patches import deform_patch
-from gaussian_swaying.mpm.twins import Composed, Tables
+from gaussian_swaying.mpm.device_functions import Composed, Tables
 from gaussian_swaying.wind.effects import CylinderObstacle, EllipsoidObstacle, LogProfile, Plume, PowerProfile
 from gaussian_swaying.wind.field import FlowKey
 from gaussian_swaying.wind.force import Places
@@ -192,7 +192,7 @@ def test_a_force_in_many_winds():
     assert torch.equal(batch.winds(double(0.7), 1e-3, 6), listed.winds(double(0.7), 1e-3, 6))
     assert batch.uniform
     assert batch.recordable
-    assert batch.twin() is not None
+    assert batch.device_function() is not None
 
 
 @pytest.mark.parametrize("batch", [(), (2,)])
@@ -202,7 +202,7 @@ def test_a_wind_with_effects_is_asked_where_the_particles_are(batch):
     shaped = WindField([3.0, 1.0, 0.0], modulations=[UniformGust(0.5, interval=4 * DT)], effects=effects)
     _, state, load = _setting([shaped, GUSTS] if batch else shaped, batch)
     assert not load.uniform
-    assert load.twin() is None or not batch
+    assert load.device_function() is None or not batch
     assert load.recordable
     found = load.air(state.time, state.position)
     own = shaped.at(state.time, state.position[0] if batch else state.position)
@@ -307,7 +307,7 @@ SOFT = {"drag_step": "semi_implicit"}
 def test_the_kernels_blow_as_torch_does(kernel_device, formulation, name, options):
     """Also at later times: on a GPU the third rollout is replayed."""
     solver, reference, state, load = _pair(kernel_device, lambda: _wind(name), formulation, **options)
-    assert load.twin() is not None
+    assert load.device_function() is not None
     assert (load.sums is not None) == ("groups" in options)
     load.refresh(state)
     for _ in range(3):
@@ -348,7 +348,7 @@ def test_only_what_has_changed_is_written_again(kernel_device, monkeypatch):
 
     def take():
         written.clear()
-        tables.take([load.twin()], Composed([load.twin()]))
+        tables.take([load.device_function()], Composed([load.device_function()]))
         return list(written)
 
     turbulence, shelter = [21, 8 * 6 * 4 * 3], [21, 8**3]
@@ -390,17 +390,17 @@ def test_the_host_reads_nothing_of_a_wind():
 
 
 def test_what_the_kernels_do_not_know_runs_in_torch():
-    """A subclass does not inherit the twin, nor does a wind have one without those of all effects."""
+    """A subclass does not inherit the device function, nor does a wind have one without those of all effects."""
 
     class Doubled(LogProfile):
         def forward(self, velocity, position, moment):
             return 2 * super().forward(velocity, position, moment)
 
     class Same(LogProfile):
-        twin = LogProfile.twin
+        device_function = LogProfile.device_function
 
-    assert Doubled().twin() is None
-    assert Same().twin().function is LogProfile().twin().function
+    assert Doubled().device_function() is None
+    assert Same().device_function().function is LogProfile().device_function().function
     for effects in ([Doubled()], [Same(), Doubled(), EllipsoidObstacle(MIDDLE, [0.05] * 3)]):
         wind = WindField([1.0, 0.0, 0.0], effects=effects)
-        assert _setting(wind)[2].twin() is None
+        assert _setting(wind)[2].device_function() is None

@@ -15,7 +15,7 @@ from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.damping import kelvin_voigt
 from gaussian_swaying.mpm.dispatch import pk1, pk1_adjoint
 from gaussian_swaying.mpm.sheets import flattened, flattened_adjoint, sheet_stress_adjoint, without_normal
-from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights, node_weight, sums, twin_data, vector
+from gaussian_swaying.mpm.triton.shared import VARIES, axis_weights, node_weight, numbers_of_force, sums, vector
 from gaussian_swaying.mpm.triton.total_kernels import cells_of, gather, law_row, load_particles, motion
 
 kelvin_voigt_adjoint = vjp(kelvin_voigt, {"F": 9, "rate": 9, "mu": 0, "lam": 0, "time": 0}, ("F", "rate", "mu", "lam"))
@@ -113,7 +113,9 @@ def particles_adjoint(
         by_mu *= -volume
         by_lam *= -volume
         if LOADED:
-            point, own, now = twin_data(0, FORCES, index, mask, scene, values, count, vectors, scenes, step, numbers)
+            point, own, now = numbers_of_force(
+                0, FORCES, index, mask, scene, values, count, vectors, scenes, step, numbers
+            )
             more, by_v, by_vector, by_numbers = FORCES.adjoints[0](F, v, point, own, now, numbers + FORCES.tables[0], a)
             by_F = axpy9(1.0, by_F, 1.0, more)
             if SHARES:

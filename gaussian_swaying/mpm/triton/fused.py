@@ -19,13 +19,13 @@ from torch import Tensor
 from gaussian_swaying.kernels.graphs import Repeater, fingerprint
 from gaussian_swaying.kernels.language import INTERPRETED
 from gaussian_swaying.kernels.launch import call, compiles, lanes, launch
+from gaussian_swaying.mpm.device_functions import DeviceFunction, Loads
 from gaussian_swaying.mpm.dispatch import BodyLaws, in_common
 from gaussian_swaying.mpm.forces import MOST_STEPS, Force, added, divide, split, tensors_of
 from gaussian_swaying.mpm.formulation import Formulation
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.timestep import kick_time
 from gaussian_swaying.mpm.triton import shared as kernels
-from gaussian_swaying.mpm.twins import Loads, Twin
 
 MAX_STEPS = MOST_STEPS
 """Number of substeps whose schedule fits in the buffers; longer rollouts are run in parts."""
@@ -156,7 +156,7 @@ class Fused(ABC):
             state: The state now.
             dt: Substep [s].
             steps: Number of substeps.
-            forces: Forces; those without a twin must be recordable.
+            forces: Forces; those without a device function must be recordable.
             force: Force [N], shape (..., P, 3), or None; only without ``forces``.
             drag: Its resistance [kg/s], shape (..., P), or None.
             looks: Numbers of the substeps after which the wave speed is measured, if ``watches``.
@@ -167,8 +167,8 @@ class Fused(ABC):
         """
         with at_home(self.speed):
             self.speed.zero_()
-            fused, twins, self.asked = divide(forces)
-            options = self.options_for(twins)
+            fused, device_functions, self.asked = divide(forces)
+            options = self.options_for(device_functions)
             options["FORCE"] = len(self.asked) > 0 or force is not None or drag is not None
             options["IMPLICIT"] = options["IMPLICIT"] or drag is not None or self._resists(state)
             if options["FORCE"]:
@@ -176,7 +176,7 @@ class Fused(ABC):
                     self.force_in = torch.zeros(self.count, 4, **self.like)
                 self.force_in.zero_()
                 self._fill(force, drag)
-            loaded = len(twins) > 0 or options["FORCE"]
+            loaded = len(device_functions) > 0 or options["FORCE"]
             for first in range(0, steps, MAX_STEPS):
                 count = min(steps - first, MAX_STEPS)
                 marks = [look - first for look in looks if first < look <= first + count]
@@ -199,9 +199,9 @@ class Fused(ABC):
         if loaded:
             self.load.zero_()
 
-    def options_for(self, twins: Sequence[Twin]) -> dict[str, Any]:
+    def options_for(self, device_functions: Sequence[DeviceFunction]) -> dict[str, Any]:
         """Constants of the kernels of a substep with some forces alone, whose numbers are copied if they changed."""
-        values = self.loads.take(twins, MAX_STEPS)
+        values = self.loads.take(device_functions, MAX_STEPS)
         check_indices(self.loads.layout.size)
         if values is not None:
             self._take_values(values)
@@ -211,7 +211,7 @@ class Fused(ABC):
             "VISCOUS": self.settings.stiffness_damping > 0,
             "FORCES": self.loads.layout,
             "FORCE": False,
-            "IMPLICIT": any(twin.implicit for twin in twins),
+            "IMPLICIT": any(device_function.implicit for device_function in device_functions),
         }
 
     def table(self, kick: float, dt: float, steps: int) -> Tensor:
@@ -224,7 +224,7 @@ class Fused(ABC):
         return table
 
     def _key_of(self, forces: Sequence[Force]) -> tuple[object, ...] | None:
-        """Return the key of the recorded numbers of forces with twins; None if they cannot be recorded."""
+        """Return the key of the recorded numbers of forces with device functions; None if they cannot be recorded."""
         here = all(tensor.device == self.device for tensor in tensors_of(forces))
         recordable = here and all(force.recordable for force in forces)
         return (*forces, self.loads.layout, fingerprint(forces)) if recordable else None

@@ -115,7 +115,8 @@ class FusedContact:
         self.within = self.status[int(kernels.WITHIN.value)]
         self.friction = fields.new_tensor([float(b.friction) for _, b in stage.obstacles] or [0.0])
         self.solids = [
-            None if obstacle.twin() is None else Solids([(obstacle, 0)], fields) for _, obstacle in stage.obstacles
+            None if obstacle.device_function() is None else Solids([(obstacle, 0)], fields)
+            for _, obstacle in stage.obstacles
         ]
         """For each obstacle its tables; None for one that runs in torch."""
         self.programs = self._programs()
@@ -265,8 +266,8 @@ class FusedContact:
                     launch(kernels.obstacle_places, (-(-self.places // one),))(
                         self.position, self.moving, self.thickness, self.wall_gap[k], self.wall_normal[k],
                         self.wall_drive[k], self.wall_valid[k], self.within, self.places, solid.rows, solid.windows,
-                        solid.poses, solid.tables.buffer, time, dt, SLACK * dx, first_step, offset, SOLIDS=solid.twins,
-                        MOVES=solid.moves[0], BLOCK=one, num_warps=4,
+                        solid.poses, solid.tables.buffer, time, dt, SLACK * dx, first_step, offset,
+                        SOLIDS=solid.device_functions, MOVES=solid.moves[0], BLOCK=one, num_warps=4,
                     )  # fmt: skip
                     continue
                 gap, normal, drive = obstacle.touch(self.position, time, dt)

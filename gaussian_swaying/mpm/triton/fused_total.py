@@ -529,14 +529,18 @@ class DifferentiableTotal(FusedTotal):
         points = bound.points
         if not self.plain or self.touching is not None:
             return "boundaries other than pins that hold all the time, and contact, have no backward kernels"
-        twin = forces[0].twin() if forces else None
-        if len(forces) > 1 or (forces and twin is None):
-            return "only one force with a Triton twin has a backward kernel"
-        if twin is not None and twin.adjoint is None:
+        device_function = forces[0].device_function() if forces else None
+        if len(forces) > 1 or (forces and device_function is None):
+            return "only one force with a device function has a backward kernel"
+        if device_function is not None and device_function.adjoint is None:
             return f"this {type(forces[0]).__name__} has no backward kernel"
         free = [points.mass, points.volume, points.youngs_modulus, points.poisson_ratio, points.bending]
         fixed = [t for t in bound.tensors() if not any(t is other for other in free)]
-        fixed += [] if twin is None else [t for t in tensors_of(forces) if any(t is source for source in twin.sources)]
+        fixed += (
+            []
+            if device_function is None
+            else [t for t in tensors_of(forces) if any(t is source for source in device_function.sources)]
+        )
         fixed += [t for law in points.laws for t in (*law.parameters(), *law.buffers())]
         if any(t.requires_grad for t in fixed):
             return "a gradient by rest positions, patches, boundaries or numbers of a law needs torch"
@@ -567,9 +571,9 @@ class DifferentiableTotal(FusedTotal):
         run = _Run(self, state, dt, steps, segment(steps, checkpoint, self.nodes), tuple(forces), watch)
         vectors = numbers = None
         if forces:
-            (twin,) = divide(forces)[1]
-            vectors = twin.per_substep.take(state.time, torch.full_like(state.time, dt), steps)
-            numbers = torch.as_tensor(twin.numbers.take())
+            (device_function,) = divide(forces)[1]
+            vectors = device_function.per_substep.take(state.time, torch.full_like(state.time, dt), steps)
+            numbers = torch.as_tensor(device_function.numbers.take())
         bound = self.bound
         laws, points, pinned = bound.laws, bound.points, bound.pinned
         displacement, velocity = _Rollout.apply(

@@ -332,7 +332,7 @@ class FusedUpdated(Fused):
             self.pressed, self.pressed.shape[1], self.windows_of_pins, self.marks_of_pins, self.marks_of_pins.shape[1],
             *grid.offset, ny, nz, grid.node_count, grid.dx, IMPLICIT=options["IMPLICIT"], WIDTH=self.momentum.shape[1],
             KEEP=acting, TURNS=() if acting else self.turns, BOUNDARIES=len(self.bound.boundaries),
-            SOLIDS=solids.twins, KINDS=solids.kinds, MOVES=solids.moves, MOVING=any(solids.moves),
+            SOLIDS=solids.device_functions, KINDS=solids.kinds, MOVES=solids.moves, MOVING=any(solids.moves),
             SCENES=self.scenes > 1, SPARSE=not (self.atomic or acting), BLOCK=block, num_warps=4,
         )  # fmt: skip
         if acting:

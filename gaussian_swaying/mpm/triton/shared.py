@@ -104,7 +104,7 @@ def _columns(values, count, index, mask, FIRST: tl.constexpr, COUNT: tl.constexp
 
 
 @triton.jit
-def twin_data(
+def numbers_of_force(
     k: tl.constexpr, FORCES: tl.constexpr, index, mask, scene, values, count, vectors, scenes, step, numbers
 ):  # fmt: skip
     """The numbers that the device function of force k gets: of its points, of all, and of the substep."""
@@ -115,23 +115,23 @@ def twin_data(
 
 
 @triton.jit
-def _twin_force(
+def _force(
     k: tl.constexpr, FORCES: tl.constexpr, F, velocity, position, index, mask, scene, values, count, vectors, scenes,
     step, numbers
 ):  # fmt: skip
     """Force k on some particles [N] and its resistance [kg/s]."""
     OPTIONS: tl.constexpr = FORCES.options[k]  # Triton 3.6 passes a tuple of numbers only as a named constant
-    point, own, now = twin_data(k, FORCES, index, mask, scene, values, count, vectors, scenes, step, numbers)
+    point, own, now = numbers_of_force(k, FORCES, index, mask, scene, values, count, vectors, scenes, step, numbers)
     return FORCES.functions[k](F, velocity, position, point, own, now, numbers + FORCES.tables[k], OPTIONS)
 
 
 @triton.jit
-def twin_forces(
+def sum_of_forces(
     FORCES: tl.constexpr, F, velocity, position, index, mask, scene, values, count, vectors, scenes, step, numbers
 ):  # fmt: skip
-    """Sum of the forces with twins on some particles [N] and of their resistances [kg/s]; FORCES: ``Composed``."""
+    """Sum of the forces of kernels on some particles [N] and of their resistances [kg/s]; FORCES: ``Composed``."""
     for k in tl.static_range(len(FORCES.functions)):
-        more, drag = _twin_force(
+        more, drag = _force(
             k, FORCES, F, velocity, position, index, mask, scene, values, count, vectors, scenes, step, numbers
         )
         if k == 0:

@@ -2,7 +2,7 @@
 
 from gaussian_swaying.geometry.linalg_triton import add3, axpy3, cross3, load3, matvec, store3, transpose
 from gaussian_swaying.kernels.language import tl, triton
-from gaussian_swaying.mpm.triton.shared import VARIES, twin_forces
+from gaussian_swaying.mpm.triton.shared import VARIES, sum_of_forces
 
 
 @triton.jit(do_not_specialize=VARIES)
@@ -36,7 +36,7 @@ def site_forces(
     bend = cross3((x, y, z), shift)
     start = load3(rest, 1, 3 * index, mask)
     place = add3(start, 1.0, axpy3(0.5, bend, 1.0, shift))
-    force, resistance = twin_forces(
+    force, resistance = sum_of_forces(
         FORCES, R, matvec(R, speed), place, index, mask, scene, values, count, vectors, scenes, step_offset, numbers
     )
     store3(out, 1, 8 * index, matvec(transpose(R), force), mask)

@@ -22,8 +22,8 @@ from gaussian_swaying.mpm.triton.shared import (
     keep_largest,
     load_four,
     node_weight,
+    sum_of_forces,
     sums,
-    twin_forces,
     vector,
     wave_speed,
 )
@@ -140,8 +140,8 @@ def total_particles(
     """``total``: forces of the particles of some cells, summed into 27 rows of ``partial`` per cell.
 
     With VIRTUAL the nodes of each cell are columns of ``cell_nodes``, and ``cell_node`` only says where it lies.
-    Lanes without a particle have no volume, values of a twin or mass, so they add nothing. The first step of a rollout
-    takes the previous substep from row 0 of the schedule.
+    Lanes without a particle have no volume, values of a force or mass, so they add nothing. The first step of a
+    rollout takes the previous substep from row 0 of the schedule.
     """
     LOADED: tl.constexpr = (len(FORCES.functions) > 0) or FORCE
     cell, real, start, end, node, scene, longest = cells_of(cell_start, cell_node, cell_scene, cells, CELLS)
@@ -186,7 +186,7 @@ def total_particles(
                 (by + oy + f[1]) * dx + u[1],
                 (within - bx * sx - by * sy + oz + f[2]) * dx + u[2],
             )
-            value, resistance = twin_forces(
+            value, resistance = sum_of_forces(
                 FORCES, F, v, at, index, mask, scene, values, count, vectors, scenes, step, numbers
             )
         if FORCE:

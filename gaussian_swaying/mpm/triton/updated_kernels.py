@@ -35,7 +35,7 @@ from gaussian_swaying.mpm.triton.shared import (
     keep_largest,
     load_four,
     node_weight,
-    twin_forces,
+    sum_of_forces,
     vector,
     wave_speed,
 )
@@ -194,7 +194,7 @@ def updated_particles(
     if SCATTER:
         if len(FORCES.functions) > 0:
             values = moving + (40 if PLASTIC else 31) * count
-            force, resistance = twin_forces(
+            force, resistance = sum_of_forces(
                 FORCES, F_total, v, x, index, mask, scene, values, count, vectors, scenes, step, numbers
             )
         if FORCE:

@@ -204,12 +204,14 @@ def test_conditions_can_be_copied_saved_and_narrowed(name, formulation):
     run = {"dx": 0.1, "formulation": formulation}
     push = 0.3 * points.position.flip(-1) if name == "rigid" else None  # which free fall does not strain
     known = march(MPMSolver(**run, boundaries=[boundary]), points, 2e-3, 6, push)[-1]
-    twin = copy.deepcopy(boundary)
+    device_function = copy.deepcopy(boundary)
     for tensor in boundary.buffers():
         tensor.zero_()
-    assert torch.equal(march(MPMSolver(**run, boundaries=[twin]), points, 2e-3, 6, push)[-1].position, known.position)
+    assert torch.equal(
+        march(MPMSolver(**run, boundaries=[device_function]), points, 2e-3, 6, push)[-1].position, known.position
+    )
     loaded = MPMSolver(**run, boundaries=[boundary])
-    loaded.load_state_dict(MPMSolver(**run, boundaries=[twin]).state_dict())
+    loaded.load_state_dict(MPMSolver(**run, boundaries=[device_function]).state_dict())
     assert torch.equal(march(loaded, points, 2e-3, 6, push)[-1].position, known.position)
     assert float((known.position - march(MPMSolver(**run), points, 2e-3, 6, push)[-1].position).abs().max()) > 1e-5
 

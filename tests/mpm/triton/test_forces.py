@@ -1,4 +1,4 @@
-"""Wind, custom forces and their twins in the fused substep."""
+"""Wind, custom forces and their device functions in the fused substep."""
 
 import pytest
 import torch
@@ -7,8 +7,8 @@ from catalogue import ELASTIC, PLASTIC
 from gaussian_swaying import Force, PinnedRegion, WindField
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.colliders import Plane
+from gaussian_swaying.mpm.device_functions import DeviceFunction, Numbers
 from gaussian_swaying.mpm.triton import fused, fused_updated
-from gaussian_swaying.mpm.twins import Numbers, Twin
 
 from .bodies import (
     DT,
@@ -176,7 +176,7 @@ def _toward(F, velocity, position, point, numbers, now, table, OPTIONS: tl.const
 
 
 class _Toward(Force):
-    """A force outside the package with a twin."""
+    """A force outside the package with a device function."""
 
     def __init__(self, points, resists):
         super().__init__()
@@ -186,8 +186,8 @@ class _Toward(Force):
     def along(self, time):
         return torch.stack([300 * time + 9, -5 + 0 * time, 1 + 2000 * time], dim=-1)
 
-    def twin(self):
-        return Twin(
+    def device_function(self):
+        return DeviceFunction(
             _toward,
             options=(self.resists,),
             implicit=self.resists,

@@ -1,9 +1,9 @@
-"""One way to declare a compiled twin: forces, effects of the wind and boundaries return a :class:`Twin`.
+"""One way to declare a device function: forces, effects of the wind and boundaries return a :class:`DeviceFunction`.
 
-The torch methods of a component are its definition. A twin is the same in a device function: scalars in, scalars out.
+It takes and returns scalars, and is the definition of the component: torch runs it, too.
 The kernel loads the numbers that the function gets, so the function itself only loads from its ``table``, as
 ``tl.load(table + index)``. Vectors are tuples of three scalars, matrices of nine, row by row. ``OPTIONS`` are constants
-for which the function is compiled; the last of them is the twin's parts, a :class:`Composed`.
+for which the function is compiled; the last of them is its parts, a :class:`Composed`.
 
 - Force: ``(F, velocity, position, point, numbers, now, table, OPTIONS)`` returns the force (three numbers) and the
   resistance, zero for none. ``F`` is the total deformation gradient. Both must be zero where all numbers of the point
@@ -40,7 +40,7 @@ NONE = Numbers(0, tuple)
 
 
 @dataclass(frozen=True)
-class Twin:
+class DeviceFunction:
     """A device function, and the numbers that it gets.
 
     Attributes:
@@ -61,7 +61,7 @@ class Twin:
             the gradients of a . force, with three numbers a: by F (nine), by the velocity (three), by the first three
             numbers of the substep and by the first three of ``numbers``. No other input of the force may require a
             gradient then. None for a force whose gradients need torch.
-        parts: Twins that the function calls, such as those of the effects of a wind.
+        parts: Device functions that the function calls, such as those of the effects of a wind.
     """
 
     function: Any
@@ -73,42 +73,46 @@ class Twin:
     sources: tuple[Tensor | nn.Module, ...] = ()
     implicit: bool = False
     adjoint: Any = None
-    parts: tuple[Twin, ...] = ()
+    parts: tuple[DeviceFunction, ...] = ()
 
 
-class Twinned(Fixed):
-    """Base of components that may have a twin; a subclass does not inherit it, because it may compute something else.
+class Compilable(Fixed):
+    """Base of components that may have a device function.
 
-    A subclass that computes the same says ``twin = Base.twin``.
+    A subclass does not inherit it, because it may compute something else.
+
+    One that computes the same says ``device_function = Base.device_function``.
     """
 
     def __init_subclass__(cls, **settings: Any) -> None:
         super().__init_subclass__(**settings)
-        if "twin" not in vars(cls):
-            cls.twin = Twinned.twin  # type: ignore[method-assign]
+        if "device_function" not in vars(cls):
+            cls.device_function = Compilable.device_function  # type: ignore[method-assign]
 
-    def twin(self) -> Twin | None:
-        """The compiled twin; None for a component that runs in torch only. It is cheap: numbers are taken later."""
+    def device_function(self) -> DeviceFunction | None:
+        """The device function; None for a component that runs in torch only. It is cheap: numbers are taken later."""
         return None
 
-    def nearest_twin(self) -> Twin | None:
-        """The twin, or else that of the nearest base that has one, which is the definition in torch, too."""
-        own = (vars(kind).get("twin", Twinned.twin) for kind in type(self).__mro__)
-        found: Twin | None = next((twin for twin in own if twin is not Twinned.twin), Twinned.twin)(self)
+    def nearest_device_function(self) -> DeviceFunction | None:
+        """The device function, or else that of the nearest base that has one."""
+        own = (vars(kind).get("device_function", Compilable.device_function) for kind in type(self).__mro__)
+        found: DeviceFunction | None = next(
+            (one for one in own if one is not Compilable.device_function), Compilable.device_function
+        )(self)
         return found
 
 
 class Composed:
-    """The device functions of several twins, and where each finds its numbers, as one constant of a compiled kernel.
+    """Several device functions, and where each finds its numbers, as one constant of a compiled kernel.
 
     Args:
-        twins: The twins.
+        given: The device functions.
 
     Attributes:
         functions: Their device functions.
         adjoints: Those of the gradients, or None.
         options: The options of each, and its parts.
-        per_point: First and number of the numbers of a point, for each twin; the others likewise.
+        per_point: First and number of the numbers of a point, for each device function; the others likewise.
         numbers: Those of all points.
         per_substep: Those of a substep.
         tables: Where the table of each starts: that of its parts (``size`` entries), and then its own.
@@ -118,15 +122,15 @@ class Composed:
         cache_key: Changes with the source of the functions, for the caches of Triton.
     """
 
-    def __init__(self, twins: Sequence[Twin]) -> None:
-        self.parts = tuple(Composed(twin.parts) for twin in twins)
-        self.functions = tuple(twin.function for twin in twins)
-        self.adjoints = tuple(twin.adjoint for twin in twins)
-        self.options = tuple((*twin.options, part) for twin, part in zip(twins, self.parts, strict=True))
-        self.per_point = _places(twin.per_point.count for twin in twins)
-        self.numbers = _places(twin.numbers.count for twin in twins)
-        self.per_substep = _places(twin.per_substep.count for twin in twins)
-        lengths = [part.size + twin.table.count for twin, part in zip(twins, self.parts, strict=True)]
+    def __init__(self, given: Sequence[DeviceFunction]) -> None:
+        self.parts = tuple(Composed(one.parts) for one in given)
+        self.functions = tuple(one.function for one in given)
+        self.adjoints = tuple(one.adjoint for one in given)
+        self.options = tuple((*one.options, part) for one, part in zip(given, self.parts, strict=True))
+        self.per_point = _places(one.per_point.count for one in given)
+        self.numbers = _places(one.numbers.count for one in given)
+        self.per_substep = _places(one.per_substep.count for one in given)
+        lengths = [part.size + one.table.count for one, part in zip(given, self.parts, strict=True)]
         start = end_of(self.numbers)
         self.tables = tuple(start + first for first, _ in _places(lengths))
         self.size: int = start + sum(lengths)
@@ -136,7 +140,7 @@ class Composed:
         self.cache_key = hashlib.sha256(repr((functions, layout)).encode()).hexdigest()
 
     def __repr__(self) -> str:
-        return f"Twins_{self.cache_key[:16]}"  # part of the names and keys of compiled functions
+        return f"DeviceFunctions_{self.cache_key[:16]}"  # part of the names and keys of compiled functions
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Composed) and self.cache_key == other.cache_key
@@ -165,7 +169,7 @@ def device_key(function: Any) -> str:
 
 
 class Tables:
-    """Numbers and tables of twins in one buffer; those of a twin are written again only if its sources have changed.
+    """Numbers and tables of device functions in one buffer; those of one are written only if its sources have changed.
 
     Args:
         device: Device of the buffer.
@@ -181,13 +185,13 @@ class Tables:
         self._layout: Composed | None = None
         self._seen: dict[int, tuple[object, object]] = {}
 
-    def take(self, twins: Sequence[Twin], layout: Composed, numbers: bool = False) -> bool:
+    def take(self, given: Sequence[DeviceFunction], layout: Composed, numbers: bool = False) -> bool:
         """Bring the buffer up to date.
 
         Args:
-            twins: The twins.
-            layout: The same twins, composed.
-            numbers: Whether to take the ``numbers`` of these twins, too; those of their parts are always taken.
+            given: The device functions.
+            layout: The same, composed.
+            numbers: Whether to take their ``numbers``, too; those of their parts are always taken.
 
         Returns:
             True unless all is as it was; always for tensors of inference mode, whose changes cannot be detected.
@@ -197,9 +201,9 @@ class Tables:
         changed = layout != self._layout
         if changed:
             self._layout, self._seen = layout, {}
-        for k, (twin, entries) in enumerate(_pieces(twins, layout, 0, numbers)):
-            modules = [source for source in twin.sources if isinstance(source, nn.Module)]
-            tensors = [source for source in twin.sources if isinstance(source, Tensor)] + tensors_in(modules)
+        for k, (one, entries) in enumerate(_pieces(given, layout, 0, numbers)):
+            modules = [source for source in one.sources if isinstance(source, nn.Module)]
+            tensors = [source for source in one.sources if isinstance(source, Tensor)] + tensors_in(modules)
             key = None
             if not any(tensor.is_inference() for tensor in tensors):
                 ids = tuple(map(id, (*modules, *tensors)))
@@ -208,19 +212,19 @@ class Tables:
                 changed, self._seen[k] = True, (key, (modules, tensors))  # so that no new object gets an old id
                 for first, values in entries:
                     if values.count:
-                        given = values.take()
-                        given = given if isinstance(given, Tensor) else torch.tensor(given, dtype=torch.float64)
-                        self.buffer[first : first + values.count].copy_(given.reshape(-1))
+                        found = values.take()
+                        found = found if isinstance(found, Tensor) else torch.tensor(found, dtype=torch.float64)
+                        self.buffer[first : first + values.count].copy_(found.reshape(-1))
         return changed
 
 
 def _pieces(
-    twins: Sequence[Twin], layout: Composed, start: int, numbers: bool
-) -> Iterator[tuple[Twin, list[tuple[int, Numbers]]]]:
-    """Yield each twin and its parts with the places of its numbers and of its table in a buffer."""
-    for twin, part, (first, _), table in zip(twins, layout.parts, layout.numbers, layout.tables, strict=True):
-        yield from _pieces(twin.parts, part, start + table, True)
-        yield twin, [(start + first, twin.numbers if numbers else NONE), (start + table + part.size, twin.table)]
+    given: Sequence[DeviceFunction], layout: Composed, start: int, numbers: bool
+) -> Iterator[tuple[DeviceFunction, list[tuple[int, Numbers]]]]:
+    """Yield each device function and its parts with the places of its numbers and of its table in a buffer."""
+    for one, part, (first, _), table in zip(given, layout.parts, layout.numbers, layout.tables, strict=True):
+        yield from _pieces(one.parts, part, start + table, True)
+        yield (one, [(start + first, one.numbers if numbers else NONE), (start + table + part.size, one.table)])
 
 
 class Loads:
@@ -238,33 +242,33 @@ class Loads:
 
     def __init__(self, batch: torch.Size, like: dict[str, Any]) -> None:
         self.batch, self.scenes, self.like = batch, max(1, batch[:-1].numel()), like
-        self.twins: Sequence[Twin] = ()
+        self.device_functions: Sequence[DeviceFunction] = ()
         self.layout, self.tables, self.vectors = Composed(()), Tables(**like), torch.zeros(0, **like)
 
-    def take(self, twins: Sequence[Twin], steps: int) -> Tensor | None:
+    def take(self, given: Sequence[DeviceFunction], steps: int) -> Tensor | None:
         """Take all but the numbers of a rollout; those of the points, shape (N, n), or None if they are as they were.
 
         Args:
-            twins: The forces.
+            given: The forces.
             steps: Most substeps of a rollout.
         """
-        self.twins, self.layout = twins, Composed(twins)
+        self.device_functions, self.layout = given, Composed(given)
         room = steps * self.scenes * self.layout.width
-        if twins and len(self.vectors) < room:
+        if given and len(self.vectors) < room:
             self.vectors = torch.zeros(room, **self.like)
-        if not self.tables.take(twins, self.layout):
+        if not self.tables.take(given, self.layout):
             return None
-        values = [twin.per_point.take() for twin in twins if twin.per_point.count]
+        values = [one.per_point.take() for one in given if one.per_point.count]
         rows = [value.expand(*self.batch, value.shape[-1]).flatten(0, -2) for value in values]
         return torch.cat(rows, dim=-1) if rows else None
 
     def begin(self, time: Tensor, dt: Tensor, steps: int) -> None:
         """Take the numbers of a rollout, from a time on [s]."""
-        for k, (twin, (first, many)) in enumerate(zip(self.twins, self.layout.numbers, strict=True)):
+        for k, (one, (first, many)) in enumerate(zip(self.device_functions, self.layout.numbers, strict=True)):
             if many:
-                self.tables.buffer[first : first + many].copy_(torch.as_tensor(twin.numbers.take()))
-            if twin.per_substep.count:
-                self.write(k, torch.as_tensor(twin.per_substep.take(time, dt, steps)))
+                self.tables.buffer[first : first + many].copy_(torch.as_tensor(one.numbers.take()))
+            if one.per_substep.count:
+                self.write(k, torch.as_tensor(one.per_substep.take(time, dt, steps)))
 
     def write(self, force: int, rows: Tensor) -> None:
         """Write the numbers of a force for some substeps, shape (steps, n) or (steps, scenes, 1, n)."""
