@@ -22,7 +22,7 @@ sum is bounded by :math:`\sum_i |w_i| s_i / m_i`, :math:`s_i = \sum |w_i| c`, wi
 Two samples touch if one lies above the disc of the other. With :math:`a` the way from one to the other, the normal is
 :math:`\sum (a \cdot n)\,n` over the discs above which the other lies, normalised: it needs no orientation of
 the normals :math:`n`, and for an edge that meets a face it is the normal of the face. Kernels do all this
-(:mod:`~gaussian_swaying.mpm.triton.contact_kernels`).
+(:mod:`~gaussian_swaying.mpm.contact_kernels`).
 
 Friction that sticks yields a little: with step :math:`\alpha` and friction :math:`j_t` it leaves the slip
 :math:`v_t = -c\,j_t / \alpha`, c = ``CREEP`` (Todorov 2014, "Convex and analytically-invertible dynamics with contacts

@@ -33,6 +33,7 @@ from gaussian_swaying.mpm.forces import Force, added, split, tensors_of
 from gaussian_swaying.mpm.formulation import Settings, flowing
 from gaussian_swaying.mpm.modal import Analysis, analysis_of
 from gaussian_swaying.mpm.pins import PinnedPoints, PinnedRegion, RigidRegion
+from gaussian_swaying.mpm.shared_kernels import site_forces
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState, State
 from gaussian_swaying.mpm.total import Total
 from gaussian_swaying.mpm.transfer import gather, scatter
@@ -522,8 +523,6 @@ class SiteForces:
         Returns:
             Shape (..., S, 8), the last column unused.
         """
-        from gaussian_swaying.mpm.triton.site_kernels import site_forces
-
         loads, count, out = self.loads, self.rest.shape[:-1].numel(), moved.new_empty(*self.rest.shape[:-1], 8)
         block = lanes(moved.device, 128)
         with torch.cuda.device_of(out):

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.boundary import Boundary
 from gaussian_swaying.mpm.contact import Surface
-from gaussian_swaying.mpm.followers import Followers
+from gaussian_swaying.mpm.embedded import EmbeddedPoints
 from gaussian_swaying.mpm.forces import Forces
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.mpm.timestep import fixed_substeps, look_marks, substeps_per_frame
@@ -124,7 +124,7 @@ class Solver(nn.Module, ABC):
         """A solver with the same boundaries and other :attr:`settings`, without a material."""
         raise ValueError(f"{type(self).__name__} has no other settings: give it a method `like`.")
 
-    def followers(self, place: Tensor, arm: Tensor | None, nodes: Tensor | None = None) -> Followers | None:
+    def embedded(self, place: Tensor, arm: Tensor | None, nodes: Tensor | None = None) -> EmbeddedPoints | None:
         """An object that reads places in the material from a state; None to follow the nearest points.
 
         Args:

@@ -19,7 +19,7 @@ from gaussian_swaying.mpm.boundary import Boundary
 from gaussian_swaying.mpm.contact import Surface
 from gaussian_swaying.mpm.damping import damped_substep
 from gaussian_swaying.mpm.dispatch import LawDispatch
-from gaussian_swaying.mpm.followers import Followers, GridFollowers
+from gaussian_swaying.mpm.embedded import EmbeddedInGrid, EmbeddedPoints
 from gaussian_swaying.mpm.forces import Force, Forces, FunctionForce, added, as_forces, split, tensors_of
 from gaussian_swaying.mpm.formulation import Formulation, Settings, flowing
 from gaussian_swaying.mpm.guard import check_begin, check_end, check_load, check_rest
@@ -32,18 +32,18 @@ from gaussian_swaying.mpm.updated import Updated
 
 FORMULATIONS: dict[str, type[Formulation]] = {kind.name: kind for kind in (Total, Updated, Modes)}
 Fused = Any
-"""A ``mpm.triton.fused.Fused``; not imported even for its type, as the parser resolves types and Triton takes 0.1 s."""
+"""A ``mpm.run.Fused``; not imported even for its type, as the parser resolves types and Triton takes 0.1 s."""
 
 
 def _kernels_of(bound: Formulation) -> Any:
     """The class that runs a formulation in kernels."""
     if isinstance(bound, Total):
-        from gaussian_swaying.mpm.triton.fused_total import DifferentiableTotal
+        from gaussian_swaying.mpm.total_adjoint import TotalAdjoint
 
-        return DifferentiableTotal
-    from gaussian_swaying.mpm.triton.fused_updated import FusedUpdated
+        return TotalAdjoint
+    from gaussian_swaying.mpm.updated_run import UpdatedRun
 
-    return FusedUpdated
+    return UpdatedRun
 
 
 class MPMSolver(Fixed, Solver):
@@ -205,9 +205,9 @@ class MPMSolver(Fixed, Solver):
             transfer=self.transfer,
         )
 
-    def followers(self, place: Tensor, arm: Tensor | None, nodes: Tensor | None = None) -> Followers | None:
+    def embedded(self, place: Tensor, arm: Tensor | None, nodes: Tensor | None = None) -> EmbeddedPoints | None:
         """In ``total`` places are read from the nodes, each with its own stencil, or with given nodes (27, M)."""
-        return GridFollowers(place, arm, nodes) if self.neighbours_fixed else None
+        return EmbeddedInGrid(place, arm, nodes) if self.neighbours_fixed else None
 
     def continued(self, other: Solver, state: MPMState, start: MPMState) -> MPMState | None:
         """The motion of another solver as a state of this one, such as the same body with other pins.

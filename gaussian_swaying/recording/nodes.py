@@ -49,7 +49,7 @@ def join_far(near: np.ndarray, far: np.ndarray) -> np.ndarray:
 def load_nodes(path: str | os.PathLike[str]) -> Tensor:
     """Displacement of the recorded nodes [m, z up] in all frames, float32, shape (frames, nodes, 3).
 
-    The nodes are those of :meth:`~gaussian_swaying.mpm.followers.Followers.nodes`.
+    The nodes are those of :meth:`~gaussian_swaying.mpm.embedded.EmbeddedPoints.nodes`.
 
     Args:
         path: ``nodes.npz`` of a run of ``total``.

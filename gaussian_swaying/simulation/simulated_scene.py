@@ -21,7 +21,7 @@ from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.geometry.surface_normals import neighbour_normals
 from gaussian_swaying.mpm.colliders import Obstacle, StillGaussians
 from gaussian_swaying.mpm.contact import Contact, Surface
-from gaussian_swaying.mpm.followers import Followers, GridFollowers, PointFollowers, on_material
+from gaussian_swaying.mpm.embedded import EmbeddedAtPoints, EmbeddedInGrid, EmbeddedPoints, on_material
 from gaussian_swaying.mpm.joints import PointJoint
 from gaussian_swaying.mpm.state import MaterialPoints, State
 from gaussian_swaying.simulation.body import Body, body_of, specks_of
@@ -50,7 +50,7 @@ class SimulatedScene(nn.Module):
         cloud: The Gaussians of the scene, if they have been read already.
         fixed: Whether the solver keeps the neighbours of its points (``total``), as ``points: grid`` needs.
         apart: Regions whose borders no group of Gaussians crosses, in scene units: those of pins and edits.
-        followers: Returns how places are read from a state (``Solver.followers``); where it returns None, the Gaussians
+        embedded: Returns how places are read from a state (``Solver.embedded``); where it returns None, the Gaussians
             follow the points.
 
     Attributes:
@@ -88,7 +88,7 @@ class SimulatedScene(nn.Module):
         cloud: GaussianCloud | None = None,
         fixed: bool = True,
         apart: Sequence[Region] = (),
-        followers: Callable[..., Followers | None] = GridFollowers,
+        embedded: Callable[..., EmbeddedPoints | None] = EmbeddedInGrid,
     ) -> None:
         super().__init__()
         cloud = scene.cloud() if cloud is None else cloud
@@ -166,24 +166,24 @@ class SimulatedScene(nn.Module):
         self.tracked = samples if by_grid else self.points.count
         place, near = body.samples.position[:samples], body.owner[:samples]
         own = self.frame.point_to_sim(cloud.means[moving].double())
-        self.track: Followers | None = None
+        self.track: EmbeddedPoints | None = None
         if not by_grid:
             arm, points = _arm(own - place[anchor], dtype), self.points
-            self.follow: Followers = PointFollowers(anchor, arm, points.position, points.attached)
+            self.follow: EmbeddedPoints = EmbeddedAtPoints(anchor, arm, points.position, points.attached)
         else:
             read, nodes = on_material(place, near, self.points, dx)
             given = () if nodes is None else (nodes,)
-            nodal = followers(read.to(dtype), _arm(place - read, dtype), *given)
+            nodal = embedded(read.to(dtype), _arm(place - read, dtype), *given)
             if nodal is not None:
                 given = () if nodes is None else (nodes[:, anchor],)
-                follow = followers(read[anchor].to(dtype), _arm(own - read[anchor], dtype), *given)
+                follow = embedded(read[anchor].to(dtype), _arm(own - read[anchor], dtype), *given)
                 assert follow is not None
                 self.follow, self.track = follow, nodal
             else:  # a solver without nodes
                 rest = self.points.position
-                self.track = PointFollowers(near, _arm(place - rest[near].double(), dtype), rest)
+                self.track = EmbeddedAtPoints(near, _arm(place - rest[near].double(), dtype), rest)
                 near = near[anchor]
-                self.follow = PointFollowers(near, _arm(own - rest[near].double(), dtype), rest)
+                self.follow = EmbeddedAtPoints(near, _arm(own - rest[near].double(), dtype), rest)
         facing = self.frame.direction_to_sim(normals[moving].double()).to(normals.dtype)
         self.register_buffer("rest_facing", facing, persistent=False)
         felt = body.samples.area[anchor] > 0

@@ -185,7 +185,7 @@ class Simulation(Fixed):
             part.region for part in (*solver.boundaries, *edits) if isinstance(getattr(part, "region", None), Region)
         ]
         fixed, kind = bool(solver.neighbours_fixed), getattr(torch, dtype)
-        model = SimulatedScene(settings, material, solver.dx, kind, cloud, fixed, apart, solver.followers)
+        model = SimulatedScene(settings, material, solver.dx, kind, cloud, fixed, apart, solver.embedded)
         if contact is not None and not fixed:
             raise ValueError(
                 "`contact` needs `solver.formulation: total`: leave it out, as in `updated` material meets on the grid."

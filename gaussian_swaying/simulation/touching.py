@@ -13,7 +13,7 @@ from gaussian_swaying.geometry.distance import DistanceGrid
 from gaussian_swaying.geometry.groups import sums
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.mpm.contact import Contact, Surface
-from gaussian_swaying.mpm.followers import on_material
+from gaussian_swaying.mpm.embedded import on_material
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.simulation.sampling import Samples
 

@@ -13,7 +13,7 @@ from gaussian_swaying import Box, PinnedRegion, Simulation
 from gaussian_swaying.cli.evaluate import main as evaluate
 from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.geometry.regions import Sphere
-from gaussian_swaying.mpm.followers import PointFollowers
+from gaussian_swaying.mpm.embedded import EmbeddedAtPoints
 from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.simulation.batch import batch_of
 from gaussian_swaying.simulation.edits import Edit
@@ -72,7 +72,7 @@ def test_energy_is_kept_and_pins_hold(cloth):
     assert abs(total[1] - total[0]) < 0.02 * last.kinetic
     held = ~simulation.solver.free
     assert torch.equal(frames[-1].state.position[held], frames[0].state.position[held])
-    assert isinstance(simulation.scene.follow, PointFollowers)
+    assert isinstance(simulation.scene.follow, EmbeddedAtPoints)
 
 
 def test_edits_and_parameters_reach_it(simulation):

@@ -52,8 +52,8 @@ def main():
     module.launch, module.wide = launch, lambda device: True
     module.lanes, module.compiles = lambda device, gpu, cpu=8: gpu, lambda device: True
 
-    from mpm.triton.bodies import DT, make_load, make_points, make_solver, set_going
-    from mpm.triton.test_agreement import BOUNDARIES
+    from mpm.kernels.bodies import DT, make_load, make_points, make_solver, set_going
+    from mpm.kernels.test_agreement import BOUNDARIES
 
     for formulation, boundaries in (("updated", "walls and pins"), ("updated", "handle"), ("total", "two pins")):
         points = make_points("cpu", count=12, batch=(2,))

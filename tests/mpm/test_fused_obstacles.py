@@ -9,8 +9,8 @@ from gaussian_swaying import SimFrame
 from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.geometry.rotations import rotation_from_z
 from gaussian_swaying.kernels.launch import lanes, launch
+from gaussian_swaying.mpm import contact_kernels as kernels
 from gaussian_swaying.mpm.colliders import Solids
-from gaussian_swaying.mpm.triton import contact_kernels as kernels
 
 DT = 1e-3
 

@@ -21,7 +21,7 @@ from gaussian_swaying import (
 from gaussian_swaying.geometry.linalg import polar_rotation
 from gaussian_swaying.mpm.colliders import BallObstacle, Plane, VelocityBox
 from gaussian_swaying.mpm.contact import Surface
-from gaussian_swaying.mpm.followers import GridFollowers, on_material
+from gaussian_swaying.mpm.embedded import EmbeddedInGrid, on_material
 from gaussian_swaying.mpm.pins import Handle, RigidRegion
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.transfer import shifts
@@ -251,14 +251,14 @@ def test_places_follow_their_own_piece():
     start, state = rolled(points, boundaries=[PinnedRegion(EDGE)], push=push)[1:]
     place = position + 0.05
     read, nodes = on_material(place, torch.arange(len(place)), points, 1.0)
-    follow = GridFollowers(read, place - read, nodes)
+    follow = EmbeddedInGrid(read, place - read, nodes)
     move, _ = follow.motion(state)
     slack = (0.2 * (state.F_total - torch.eye(3, dtype=torch.float64)).norm(dim=(-1, -2)).amax()).clamp(min=0.01)
     assert (move - (state.position - position)).norm(dim=-1).amax() < slack
     assert follow.nodes(state).max() >= start.grid.lattice_count
     some = follow.some(torch.arange(5))
     assert torch.equal(some.motion(state)[0], move[:5])
-    glued = GridFollowers(read, place - read).motion(state)[0]
+    glued = EmbeddedInGrid(read, place - read).motion(state)[0]
     assert (glued - move).norm(dim=-1).amax() > 0.1  # from the nodes of the other piece
 
 

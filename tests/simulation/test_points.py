@@ -255,7 +255,7 @@ def test_the_default_is_the_grid_where_it_is_possible(make_simulation):
     ],
     indirect=["kernel_device"],
 )
-def test_the_kernel_of_followers_is_their_definition(up, kernel_device, make_scene):
+def test_the_kernel_of_embedded_points_is_their_definition(up, kernel_device, make_scene):
     """With arms (of faint ones), rotations and the limit of the stretch, and without."""
     if INTERPRETED:
         pytest.skip("the interpreter takes too long to replace torch")

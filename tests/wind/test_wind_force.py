@@ -24,7 +24,7 @@ from gaussian_swaying.wind.turbulence import Turbulence
 
 DT = 1e-3
 TOLERANCE = 2e-5
-"""Of kernels, relative to the largest value of a field, as in tests/mpm/triton/bodies.py."""
+"""Of kernels, relative to the largest value of a field, as in tests/mpm/kernels/bodies.py."""
 GUSTS = WindField([3.0, 1.0, 0.0], modulations=[UniformGust(0.5, interval=1.5 * DT)])
 RISING = WindField(schedule=[FlowKey(0.0, [0.0] * 3), FlowKey(4 * DT, [0.0, 20.0, 0.0])], interpolation="linear")
 TURNING = [FlowKey(0.0, [4.0, 1.0, 0.5]), FlowKey(3 * DT, [-2.0, 3.0, 0.0])]

@@ -138,7 +138,7 @@ def test_the_lists_do_not_change_the_result(monkeypatch):
     assert solver.fused().touching.interval == 64
     known = solver.rollout(state, 5e-4, 160)
     assert 1 < solver.fused().touching.interval < 64
-    monkeypatch.setattr("gaussian_swaying.mpm.triton.fused_contact.LONGEST", 1)
+    monkeypatch.setattr("gaussian_swaying.mpm.contact_run.LONGEST", 1)
     other, state = scene(points, Contact(), velocity=velocity, gravity=(0, 0, 0))
     other.rollout(still, 1e-4, 1)
     again = other.rollout(state, 5e-4, 160)

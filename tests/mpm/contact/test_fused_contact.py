@@ -7,8 +7,8 @@ from torch.testing import assert_close
 
 from gaussian_swaying import Contact, MaterialPoints, PinnedPoints
 from gaussian_swaying.kernels.derive import on_tensors
+from gaussian_swaying.mpm import contact_kernels, contact_run
 from gaussian_swaying.mpm.colliders import BallObstacle, HalfSpaceObstacle
-from gaussian_swaying.mpm.triton import contact_kernels, fused_contact
 
 from .bodies import scene, sheet
 
@@ -105,7 +105,7 @@ def test_the_lists_are_those_of_a_tree(device):
     state = solver.bound.read_particles(state, moved, 0 * moved)
     solver.rollout(state, 1e-5, 1)
     touching, stage = solver.fused().touching, solver.bound.contact
-    limit = stage.reach + fused_contact.SLACK * stage.dx + touching.margin
+    limit = stage.reach + contact_run.SLACK * stage.dx + touching.margin
     both = pairs(stage, samples(stage, state)[0], limit)
     assert both.shape[1] > 200
     assert touching.pairs == both.shape[1]
@@ -131,7 +131,7 @@ def test_nodes_without_weight_do_not_widen_the_lists(device):
     state = solver.bound.read_particles(state, torch.zeros_like(velocity), velocity)
     solver.rollout(state, 1e-5, 3)
     touching = solver.fused().touching
-    assert touching.margin == fused_contact.REACHES * solver.bound.contact.reach
+    assert touching.margin == contact_run.REACHES * solver.bound.contact.reach
     assert touching.interval > 1
 
 
@@ -140,8 +140,8 @@ def test_lists_that_do_not_fit_get_more_room(device, monkeypatch):
     points, velocity, _ = _collision(device)
     ends, rooms = [], []
     for room, slots in ((64, 32), (2, 1)):
-        monkeypatch.setattr(fused_contact, "ROOM", room)
-        monkeypatch.setattr(fused_contact, "SLOTS", slots)
+        monkeypatch.setattr(contact_run, "ROOM", room)
+        monkeypatch.setattr(contact_run, "SLOTS", slots)
         # torch makes the masses of the nodes, on a GPU in no fixed order unless told to
         settings = {"transfer": "kernels", "deterministic": True}
         solver, state = scene(points, Contact(iterations=2), velocity=velocity, **settings)
@@ -157,18 +157,18 @@ def test_lists_that_do_not_fit_get_more_room(device, monkeypatch):
 
 def test_material_that_has_collapsed_is_refused(device, monkeypatch):
     """More candidates than any buffer holds: a sentence, not wrong lists, and another rollout is possible."""
-    monkeypatch.setattr(fused_contact, "ROOM", 2)
+    monkeypatch.setattr(contact_run, "ROOM", 2)
     points, velocity, _ = _collision(device)
     solver, state = scene(points, Contact(iterations=1), velocity=velocity, transfer="kernels")
-    monkeypatch.setattr(fused_contact, "MOST_ENTRIES", 1000 * points.count)
+    monkeypatch.setattr(contact_run, "MOST_ENTRIES", 1000 * points.count)
     solver.fused()
-    monkeypatch.setattr(fused_contact, "MOST_ENTRIES", 100)
+    monkeypatch.setattr(contact_run, "MOST_ENTRIES", 100)
     touching = solver.fused().touching
     with pytest.raises(ValueError, match="the material has collapsed"):
         solver.rollout(state, 4 * DT, 1)
     assert touching.candidates.shape == (touching.places, touching.room)  # kernels would write beside them
     assert touching.other.shape == (touching.slots, touching.places)
-    monkeypatch.setattr(fused_contact, "MOST_ENTRIES", 1000 * points.count)
+    monkeypatch.setattr(contact_run, "MOST_ENTRIES", 1000 * points.count)
     again = solver.rollout(state, 4 * DT, 1)
     assert torch.isfinite(again.velocity).all()
 

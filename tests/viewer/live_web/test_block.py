@@ -149,7 +149,9 @@ def test_the_starter_of_a_plant_by_its_modes(sway, in_node):
     assert float((state.position - steady.position).norm(dim=-1).max()) > 0.1 * motion
     assert error < ROUNDED
     assert told[0]["substeps"] == steps
-    effects = [{"class_path": f"gaussian_swaying.wind.{name}"} for name in ("carried.Turbulence", "effects.LogProfile")]
+    effects = [
+        {"class_path": f"gaussian_swaying.wind.{name}"} for name in ("turbulence.Turbulence", "effects.LogProfile")
+    ]
     with pytest.raises(ValueError, match=r"of which `solver.formulation: modes` takes one Turbulence\.$"):
         check(sway(wind={"effects": effects}))
 

@@ -83,7 +83,7 @@ export class Wind {
     this.mean(time).forEach((flow, i) => (this.carried[i] += dt * flow));
   }
 
-  /** Adds the turbulence at a place [m] to an air velocity; see CarriedField in gaussian_swaying/wind/carried.py. */
+  /** Adds the turbulence at a place [m] to an air velocity; see CarriedField in gaussian_swaying/wind/tables.py. */
   stir(/** @type {number} */ time, /** @type {Float64Array} */ place, /** @type {Float64Array} */ out) {
     const { cells, axes, side, offset, scale } = this.turbulence;
     for (let i = 0; i < 3; i++) {

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.kernels.launch import lanes, launch
+from gaussian_swaying.mpm import contact_kernels as kernels
 from gaussian_swaying.mpm.colliders import Solids
 from gaussian_swaying.mpm.contact import ContactStage
-from gaussian_swaying.mpm.triton import contact_kernels as kernels
-from gaussian_swaying.mpm.triton.fused import INTERPRETED, MAX_INDEX
+from gaussian_swaying.mpm.run import INTERPRETED, MAX_INDEX
 
 if TYPE_CHECKING:
     from gaussian_swaying.mpm.total import Total
@@ -51,7 +51,7 @@ LIGHT = 0.01
 _LAUNCH: dict[str, Any] = {"num_warps": 2, "maxnreg": 128}
 
 
-class FusedContact:
+class ContactRun:
     """Contact of a body with buffers at fixed addresses, so that substeps can be recorded.
 
     If the buffers were too small, or the nodes moved farther than the lists are good for, :meth:`fits` finds that after

@@ -12,10 +12,10 @@ from catalogue import ELASTIC, PLASTIC
 
 from gaussian_swaying import Boundary, MPMSolver, PinnedRegion, WindField, WindForce
 from gaussian_swaying.geometry.regions import Everything
+from gaussian_swaying.mpm import run
 from gaussian_swaying.mpm.colliders import Plane
 from gaussian_swaying.mpm.laws.elastic import FixedCorotated
 from gaussian_swaying.mpm.pins import Impulse
-from gaussian_swaying.mpm.triton import fused
 
 from .bodies import (
     DT,
@@ -66,7 +66,7 @@ def test_buffers_end_with_their_solver(kernel_device, formulation):
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_what_is_too_large_for_the_indices_is_refused(kernel_device, formulation, monkeypatch):
     points = make_points(kernel_device, count=12)
-    monkeypatch.setattr(fused, "MAX_INDEX", 700)
+    monkeypatch.setattr(run, "MAX_INDEX", 700)
     solver = make_solver("kernels", formulation)
     state = solver.init_state(points)
     with pytest.raises(ValueError, match=r"set `solver\.transfer` to torch"):

@@ -24,9 +24,7 @@ from gaussian_swaying.geometry.linalg_triton import (
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.damping import kelvin_voigt
 from gaussian_swaying.mpm.dispatch import ROW, kirchhoff
-from gaussian_swaying.mpm.touch import POSE, acts, stop_nodes
-from gaussian_swaying.mpm.touch import ROW as SOLID_ROW
-from gaussian_swaying.mpm.triton.shared import (
+from gaussian_swaying.mpm.shared_kernels import (
     VARIES,
     account,
     add_four,
@@ -39,6 +37,8 @@ from gaussian_swaying.mpm.triton.shared import (
     vector,
     wave_speed,
 )
+from gaussian_swaying.mpm.touch import POSE, acts, stop_nodes
+from gaussian_swaying.mpm.touch import ROW as SOLID_ROW
 
 REACH = tl.constexpr(3)
 """Shuffles of a sum over neighbours: 2^REACH of them at most are added up before they are added to the grid."""

@@ -9,8 +9,13 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.linalg_triton import load3, load9, matmul, store3, transpose
+from gaussian_swaying.geometry.patches import deform_and_store
+from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.kernels.launch import lanes, launch, replaces
+from gaussian_swaying.mpm.shared_kernels import VARIES, axis_weights
 from gaussian_swaying.mpm.state import GridSpec, MaterialPoints, MPMState, State, bounding_grid
+from gaussian_swaying.mpm.total_kernels import gather as gather_nodes
 from gaussian_swaying.mpm.transfer import Stencil, bspline_stencil, gather, scatter
 from gaussian_swaying.mpm.virtual_nodes import first_nodes, point_with_nodes, virtual_nodes
 
@@ -18,7 +23,50 @@ EXTRAPOLATED = 3.0
 """Largest weight of a node at a place, over that at any material point; a node of small weights may swing far."""
 
 
-class Followers(nn.Module, ABC):
+@triton.jit(do_not_specialize=VARIES)
+def follow(
+    fields, first, table, fraction, arm, axes, means, covariance, normal, solid,
+    means_out, covariance_out, normal_out, rotation_out, square, per_metre, count, sx, sy, inverse_dx,
+    ARM: tl.constexpr, TURN: tl.constexpr, LIMIT: tl.constexpr, BLOCK: tl.constexpr, VIRTUAL: tl.constexpr,
+):  # fmt: skip
+    """One Gaussian per lane: its displacement and F from the nodes, in the axes of the scene."""
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = index < count
+    if VIRTUAL:
+        node = tl.minimum(index, count - 1)
+    else:
+        node = tl.load(first + index, mask, 0)
+    f = (
+        tl.load(fraction + index, mask, 1.0),
+        tl.load(fraction + count + index, mask, 1.0),
+        tl.load(fraction + 2 * count + index, mask, 1.0),
+    )
+    wz, gz = axis_weights(f[2], inverse_dx)
+    u, G, _v = gather_nodes(fields, node, sx, sy, f, wz, gz, inverse_dx, mask, False, table, count, VIRTUAL)
+    if ARM:
+        a = load3(arm, 1, 3 * index, mask)
+        u = (
+            u[0] + G[0] * a[0] + G[1] * a[1] + G[2] * a[2],
+            u[1] + G[3] * a[0] + G[4] * a[1] + G[5] * a[2],
+            u[2] + G[6] * a[0] + G[7] * a[1] + G[8] * a[2],
+        )
+    zero = 0 * index
+    R = load9(axes, 1, zero, mask)
+    F = matmul(matmul(transpose(R), G), R)  # zero at rest, so that nothing moves there
+    F = (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1)
+    x = load3(means, 1, 3 * index, mask)
+    x = (
+        x[0] + per_metre * (R[0] * u[0] + R[3] * u[1] + R[6] * u[2]),
+        x[1] + per_metre * (R[1] * u[0] + R[4] * u[1] + R[7] * u[2]),
+        x[2] + per_metre * (R[2] * u[0] + R[5] * u[1] + R[8] * u[2]),
+    )
+    store3(means_out, 1, 3 * index, x, mask)
+    deform_and_store(
+        F, covariance, normal, solid, covariance_out, normal_out, rotation_out, square, index, mask, TURN, LIMIT
+    )
+
+
+class EmbeddedPoints(nn.Module, ABC):
     """Places in the material whose motion is interpolated from a state.
 
     Args:
@@ -50,14 +98,14 @@ class Followers(nn.Module, ABC):
 
     def stencil(self, grid: GridSpec) -> Stencil:
         """The 27 nodes of each place."""
-        return follower_stencil(self.places, grid, self.table(grid))
+        return embedded_stencil(self.places, grid, self.table(grid))
 
     def table(self, grid: GridSpec) -> Tensor | None:
         """Nodes of the places, shape (27, M), if the grid has virtual ones."""
         return None
 
     @abstractmethod
-    def some(self, index: Tensor) -> Followers:
+    def some(self, index: Tensor) -> EmbeddedPoints:
         """Some of them, by their numbers (K,)."""
 
     def nodes(self, state: Any) -> Tensor | None:
@@ -106,12 +154,12 @@ class Followers(nn.Module, ABC):
         """Displacement and deformation gradient of the places that are read."""
 
 
-class PointFollowers(Followers):
-    """Followers of material points.
+class EmbeddedAtPoints(EmbeddedPoints):
+    """EmbeddedPoints of material points.
 
     Args:
         source: The point that each follows, shape (M,).
-        arm: See :class:`Followers`.
+        arm: See :class:`EmbeddedPoints`.
         rest: Rest positions of the points [m], shape (P, 3).
         attached: See :class:`~gaussian_swaying.mpm.state.MaterialPoints`; it decides which nodes they reach.
     """
@@ -131,9 +179,9 @@ class PointFollowers(Followers):
         """Rest positions of the points that are followed [m], shape (M, 3)."""
         return self.rest[self.source]
 
-    def some(self, index: Tensor) -> PointFollowers:
+    def some(self, index: Tensor) -> EmbeddedAtPoints:
         arm = None if self.arm is None else self.arm[index]
-        return PointFollowers(self.source[index], arm, self.rest, self._attached)
+        return EmbeddedAtPoints(self.source[index], arm, self.rest, self._attached)
 
     def table(self, grid: GridSpec) -> Tensor | None:
         virtual = virtual_nodes(first_nodes(self.rest, grid), grid, self._attached if grid.virtual else None)
@@ -147,12 +195,12 @@ class PointFollowers(Followers):
         return state.velocity[self.source]
 
 
-class GridFollowers(Followers):
-    """Followers of the nodal fields of the ``total`` formulation, each with its own stencil.
+class EmbeddedInGrid(EmbeddedPoints):
+    """EmbeddedPoints of the nodal fields of the ``total`` formulation, each with its own stencil.
 
     Args:
         place: Rest positions that are read [m], shape (M, 3).
-        arm: See :class:`Followers`.
+        arm: See :class:`EmbeddedPoints`.
         nodes: The nodes of each, shape (27, M), if they are not those of the lattice (``virtual_nodes``).
     """
 
@@ -171,9 +219,9 @@ class GridFollowers(Followers):
         """Rest positions that are read [m], shape (M, 3)."""
         return self.place
 
-    def some(self, index: Tensor) -> GridFollowers:
+    def some(self, index: Tensor) -> EmbeddedInGrid:
         nodes = None if self.own_nodes is None else self.own_nodes[:, index]
-        return GridFollowers(self.place[index], None if self.arm is None else self.arm[index], nodes)
+        return EmbeddedInGrid(self.place[index], None if self.arm is None else self.arm[index], nodes)
 
     def table(self, grid: GridSpec) -> Tensor | None:
         return self.own_nodes
@@ -183,7 +231,7 @@ class GridFollowers(Followers):
         known = self._known
         if known is None or known[0] != grid or known[1] != self.place.device:
             with torch.inference_mode(False):  # it outlives the call
-                known = (grid, self.place.device, follower_stencil(self.place, grid, self.own_nodes))
+                known = (grid, self.place.device, embedded_stencil(self.place, grid, self.own_nodes))
             self._known = known
         return known[2]
 
@@ -205,12 +253,10 @@ class GridFollowers(Followers):
         max_stretch: float | None,
         solid: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor | None] | None:
-        """See :meth:`Followers.drawn`; the kernel runs in float32, without gradients."""
+        """See :meth:`EmbeddedPoints.drawn`; the kernel runs in float32, without gradients."""
         displacement = _nodal(state.node_displacement)
         if not replaces((displacement, means, covariances, normals, self.place)):
             return None
-        from gaussian_swaying.mpm.followers_triton import follow
-
         fields = displacement.new_zeros(len(displacement), 8)
         fields[:, :3] = displacement
         axes = frame.direction_to_sim(torch.eye(3, device=means.device)).mT  # from those of the scene to z up
@@ -238,8 +284,8 @@ class GridFollowers(Followers):
         return gather(_nodal(state.node_velocity), self.stencil(state.grid))[..., 0, :]
 
 
-def follower_stencil(place: Tensor, grid: GridSpec, nodes: Tensor | None = None) -> Stencil:
-    """The stencil of followers (M, 3) [m], as that of the material in ``total``."""
+def embedded_stencil(place: Tensor, grid: GridSpec, nodes: Tensor | None = None) -> Stencil:
+    """The stencil of embedded (M, 3) [m], as that of the material in ``total``."""
     return bspline_stencil(place, grid, moments=False, snap=torch.finfo(place.dtype).eps ** 0.5, nodes=nodes)
 
 
@@ -268,9 +314,9 @@ def on_material(place: Tensor, nearest: Tensor, points: MaterialPoints, dx: floa
     """
     position = points.position
     grid = bounding_grid(position.amin(0), position.amax(0), dx, margin=0)
-    rest = follower_stencil(position, grid)
+    rest = embedded_stencil(position, grid)
     virtual = virtual_nodes(rest.first, grid, points.attached)
-    own = follower_stencil(place.to(position), grid)
+    own = embedded_stencil(place.to(position), grid)
     if virtual is None:
         mass = scatter(rest, points.mass[:, None, None])[:, 0]
         empty = gather((mass <= 0).to(mass)[:, None], own)[:, 0, 0]

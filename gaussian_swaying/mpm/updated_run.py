@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.kernels.launch import LANES, lanes, launch, wide
+from gaussian_swaying.mpm import updated_kernels as kernels
 from gaussian_swaying.mpm.boundary import Boundary
 from gaussian_swaying.mpm.colliders import Solids, solids_of
 from gaussian_swaying.mpm.formulation import Formulation, Held
 from gaussian_swaying.mpm.pins import PinnedRegion
+from gaussian_swaying.mpm.run import Fused, Part, check_indices
 from gaussian_swaying.mpm.state import GridSpec, MPMState
-from gaussian_swaying.mpm.triton import updated_kernels as kernels
-from gaussian_swaying.mpm.triton.fused import Fused, Part, check_indices
 
 SHARES = 16
 """Shares of the particles that are added to grids of their own on a CPU; the sums depend on it."""
@@ -35,7 +35,7 @@ FIRST_CROSSING = 1e-3
 """Cells that a particle enters in a substep, where nothing moves or nothing was measured."""
 
 
-class FusedUpdated(Fused):
+class UpdatedRun(Fused):
     """Substeps of the ``updated`` formulation; particles are sorted by cell at the start of each part.
 
     Args:

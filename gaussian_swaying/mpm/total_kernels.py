@@ -13,8 +13,7 @@ from gaussian_swaying.geometry.linalg_triton import add3, axpy9, columns9, load3
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.damping import kelvin_voigt
 from gaussian_swaying.mpm.dispatch import ROW, pk1
-from gaussian_swaying.mpm.sheets import flattened, sheet_pk1, without_normal
-from gaussian_swaying.mpm.triton.shared import (
+from gaussian_swaying.mpm.shared_kernels import (
     VARIES,
     account,
     add_given,
@@ -27,6 +26,7 @@ from gaussian_swaying.mpm.triton.shared import (
     vector,
     wave_speed,
 )
+from gaussian_swaying.mpm.sheets import flattened, sheet_pk1, without_normal
 
 
 @triton.jit

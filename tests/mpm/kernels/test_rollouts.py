@@ -19,11 +19,11 @@ from gaussian_swaying import (
     WindField,
 )
 from gaussian_swaying._fixed import assign
+from gaussian_swaying.mpm import run, total_run, updated_run
 from gaussian_swaying.mpm.colliders import BallObstacle, EnclosingBox, Plane, VelocityBox
 from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.mpm.pins import Handle
 from gaussian_swaying.mpm.state import GridSpec
-from gaussian_swaying.mpm.triton import fused, fused_total, fused_updated
 from gaussian_swaying.simulation.diagnostics import measure
 from gaussian_swaying.wind.field import FlowKey
 
@@ -67,8 +67,8 @@ def test_a_substep_that_changes(kernel_device, formulation):
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_rollouts_in_parts(kernel_device, formulation, monkeypatch):
     """Longer than the schedule and the sorting of the particles; the wind and the work continue."""
-    monkeypatch.setattr(fused, "MAX_STEPS", 4)
-    monkeypatch.setattr(fused_updated, "sorted_for", lambda *known: 2)
+    monkeypatch.setattr(run, "MAX_STEPS", 4)
+    monkeypatch.setattr(updated_run, "sorted_for", lambda *known: 2)
     wind = WindField(schedule=[FlowKey(0.0, [0.0] * 3), FlowKey(5 * DT, [30.0, 0.0, 0.0])], interpolation="linear")
     points = make_points(kernel_device, count=12, batch=(2,))
     load = make_load(points, [wind, WIND])
@@ -97,7 +97,7 @@ def test_looks_on_the_way(kernel_device, case, monkeypatch):
 
     With several energies, or with one that has no kernel, the checks run in torch, between the kernels' substeps.
     """
-    monkeypatch.setattr(fused_updated, "sorted_for", lambda *known: 2)
+    monkeypatch.setattr(updated_run, "sorted_for", lambda *known: 2)
     laws, formulation = case[0].split(" and "), case[1]
     index = torch.arange(24) % 2 if len(laws) > 1 else None
     points = make_points(kernel_device, [(ELASTIC | PLASTIC)[law] for law in laws], law_index=index)
@@ -119,7 +119,7 @@ def test_atomic_sums(wide, monkeypatch):
     """An older GPU adds the numbers of a node one by one; more points share a cell than are summed up before."""
     if wide and torch.cuda.get_device_capability() < (9, 0):
         pytest.skip("this GPU has no such instruction")
-    monkeypatch.setattr(fused_updated, "wide", lambda device: wide)
+    monkeypatch.setattr(updated_run, "wide", lambda device: wide)
     points = make_points(torch.device("cuda"), PLASTIC["sand"], count=100)
     check_agreement(run_both(points, lambda solver, state: solver.rollout(state, DT, 3), "updated"))
 
@@ -160,7 +160,7 @@ REPLAYED = {
 def test_replayed_rollouts_give_the_same_bits(kernel_device, case, monkeypatch):
     """On a GPU nothing is recorded at first; results stay as they are when another rollout follows."""
     steps = 37 if kernel_device.type == "cuda" else 5
-    monkeypatch.setattr(fused_total, "_PROGRAMS", 1 if case == "nodes, crowded cells" else 2048)
+    monkeypatch.setattr(total_run, "_PROGRAMS", 1 if case == "nodes, crowded cells" else 2048)
     given = REPLAYED[case]
     points = make_points(kernel_device, count=given.get("count", 12), batch=given.get("batch", ()))
     solver = make_solver("kernels", "total", boundaries=given["boundaries"]())

@@ -6,9 +6,10 @@ from catalogue import ELASTIC, PLASTIC
 
 from gaussian_swaying import Force, PinnedRegion, WindField
 from gaussian_swaying.kernels.language import tl, triton
+from gaussian_swaying.mpm import run as substeps
+from gaussian_swaying.mpm import updated_run
 from gaussian_swaying.mpm.colliders import Plane
 from gaussian_swaying.mpm.device_functions import DeviceFunction, Numbers
-from gaussian_swaying.mpm.triton import fused, fused_updated
 
 from .bodies import (
     DT,
@@ -117,8 +118,8 @@ def test_forces_in_torch_among_the_kernels(kernel_device, formulation, case, mon
     name, resistance = case
     plane = Plane([0.0, 0.0, 0.13], [0.1, 0.0, 1.0], "separate")
     held = {"boundaries": [PinnedRegion(LEFT, start=1.5 * DT), plane]}
-    monkeypatch.setattr(fused, "MAX_STEPS", 3)
-    monkeypatch.setattr(fused_updated, "sorted_for", lambda *known: 2)
+    monkeypatch.setattr(substeps, "MAX_STEPS", 3)
+    monkeypatch.setattr(updated_run, "sorted_for", lambda *known: 2)
     law = ELASTIC["corotated"] if formulation == "total" else PLASTIC["sand that swells"]
     points = make_points(kernel_device, law, count=6, batch=(2,))
     pull = _Pull(kernel_device, resistance)

@@ -19,13 +19,13 @@ from torch import Tensor
 from gaussian_swaying.kernels.graphs import Repeater, fingerprint
 from gaussian_swaying.kernels.language import INTERPRETED
 from gaussian_swaying.kernels.launch import call, compiles, lanes, launch
+from gaussian_swaying.mpm import shared_kernels as kernels
 from gaussian_swaying.mpm.device_functions import DeviceFunction, Loads
 from gaussian_swaying.mpm.dispatch import BodyLaws, in_common
 from gaussian_swaying.mpm.forces import MOST_STEPS, Force, added, divide, split, tensors_of
 from gaussian_swaying.mpm.formulation import Formulation
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.timestep import kick_time
-from gaussian_swaying.mpm.triton import shared as kernels
 
 MAX_STEPS = MOST_STEPS
 """Number of substeps whose schedule fits in the buffers; longer rollouts are run in parts."""
