@@ -57,7 +57,7 @@ class DeviceFunction:
         sources: Tensors and modules; ``per_point``, ``table`` and, except of a force, ``numbers`` are taken again when
             one of them was replaced or written to.
         implicit: Whether a force has a resistance, so that it acts at the velocity at the end of the substep.
-        adjoint: Of a force, a device function ``(F, velocity, point, numbers, now, table, a)`` that returns
+        adjoint: Of a force, what makes a device function ``(F, velocity, point, numbers, now, table, a)`` that returns
             the gradients of a . force, with three numbers a: by F (nine), by the velocity (three), by the first three
             numbers of the substep and by the first three of ``numbers``. No other input of the force may require a
             gradient then. None for a force whose gradients need torch.
@@ -110,7 +110,6 @@ class Composed:
 
     Attributes:
         functions: Their device functions.
-        adjoints: Those of the gradients, or None.
         options: The options of each, and its parts.
         per_point: First and number of the numbers of a point, for each device function; the others likewise.
         numbers: Those of all points.
@@ -125,7 +124,6 @@ class Composed:
     def __init__(self, given: Sequence[DeviceFunction]) -> None:
         self.parts = tuple(Composed(one.parts) for one in given)
         self.functions = tuple(one.function for one in given)
-        self.adjoints = tuple(one.adjoint for one in given)
         self.options = tuple((*one.options, part) for one, part in zip(given, self.parts, strict=True))
         self.per_point = _places(one.per_point.count for one in given)
         self.numbers = _places(one.numbers.count for one in given)
@@ -135,7 +133,7 @@ class Composed:
         self.tables = tuple(start + first for first, _ in _places(lengths))
         self.size: int = start + sum(lengths)
         self.width = -(-max(end_of(self.per_substep), 1) // 16) * 16
-        functions = [device_key(function) for function in (*self.functions, *self.adjoints)]
+        functions = [device_key(function) for function in self.functions]
         layout = (self.options, self.per_point, self.numbers, self.per_substep, self.tables, self.size)
         self.cache_key = hashlib.sha256(repr((functions, layout)).encode()).hexdigest()
 

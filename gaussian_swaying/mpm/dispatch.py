@@ -129,7 +129,6 @@ class BodyLaws:
         principals: Functions of the stresses that come from principal stretches; they are numbered first.
         matrices: Functions of first Piola-Kirchhoff stresses that come from F itself, numbered after those.
         flows: Functions of the plastic flow.
-        adjoints: Gradients of the stresses in the order of their numbers.
         all_flow: Whether every law flows.
         cache_key: Changes with the source of the functions, for the caches of Triton.
     """
@@ -146,17 +145,21 @@ class BodyLaws:
         order = _once(sorted(chosen, key=lambda pair: pair[0]))
         self.principals = tuple(stress for direct, stress in order if not direct)
         self.matrices = tuple(stress for direct, stress in order if direct)
-        adjoints = {stress: device.adjoint for stress, device in zip(chosen, own, strict=True)}
-        self.adjoints = tuple(adjoints[stress] for stress in order)
+        self._sources = [own[chosen.index(stress)] for stress in order]
         self.flows = _once(device.flow for device in own if device.flow)
         self.all_flow = all(device.flow for device in own)
         self.table = [
             [float(order.index(stress)), float(self.flows.index(device.flow) if device.flow else -1), *law.row]
             for law, device, stress in zip(laws, own, chosen, strict=True)
         ]
-        functions = [self.principals, self.matrices, self.flows, self.adjoints]
+        functions = [self.principals, self.matrices, self.flows]
         source = [[device_key(function) for function in part] for part in functions]
         self.cache_key = hashlib.sha256(repr((source, self.spectral, self.all_flow)).encode()).hexdigest()
+
+    @property
+    def adjoints(self) -> tuple[Any, ...]:
+        """Gradients of the stresses in the order of their numbers, derived when they are first wanted."""
+        return tuple(device.adjoint for device in self._sources)
 
     def __repr__(self) -> str:
         return f"Laws_{self.cache_key[:16]}"  # part of the names and keys of compiled functions
@@ -217,15 +220,15 @@ def pk1(F, mu, lam, row, LAWS: tl.constexpr):
 
 
 @triton.jit
-def pk1_adjoint(F, Q, mu, lam, row, LAWS: tl.constexpr):
-    """Gradient of Q : P by F, mu and lam; ``row`` as for :func:`pk1`."""
+def pk1_adjoint(F, Q, mu, lam, row, ADJOINTS: tl.constexpr):
+    """Gradient of Q : P by F, mu and lam; ``row`` as for :func:`pk1`, the laws' adjoints as the ``stresses``."""
     p = _numbers(row)
     internal = mu * 0
-    change, by_mu, by_lam = LAWS.adjoints[0](F, mu, lam, internal, p, Q)
-    if len(LAWS.adjoints) > 1:
+    change, by_mu, by_lam = ADJOINTS.stresses[0](F, mu, lam, internal, p, Q)
+    if len(ADJOINTS.stresses) > 1:
         which = tl.load(row).to(tl.int32)
-        for k in tl.static_range(1, len(LAWS.adjoints)):
-            other, one, two = LAWS.adjoints[k](F, mu, lam, internal, p, Q)
+        for k in tl.static_range(1, len(ADJOINTS.stresses)):
+            other, one, two = ADJOINTS.stresses[k](F, mu, lam, internal, p, Q)
             own = which == k
             change = where9(own, other, change)
             by_mu = tl.where(own, one, by_mu)

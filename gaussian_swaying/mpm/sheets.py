@@ -43,7 +43,7 @@ from gaussian_swaying.geometry.linalg_triton import (
     scale9,
     transpose,
 )
-from gaussian_swaying.kernels.derive import on_tensors, vjp
+from gaussian_swaying.kernels.derive import on_tensors
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.dispatch import pk1
 from gaussian_swaying.mpm.state import MaterialPoints
@@ -116,11 +116,6 @@ def sheet_stress(F, n, mu, P, flat, m, area, thickness, thinning):
     side = add3(matvec(F, shear), along - 1, out)
     own = axpy9(1.0, outer3(out, shear), 1.0, outer3(side, n))
     return axpy9(1.0, P, _DIRECTOR * mu, own)
-
-
-flattened_adjoint = vjp(flattened, {"F": 9, "n": 3, "mu": 0, "lam": 0}, ("F", "mu", "lam"))
-_SHAPED = {"flat": 9, "m": 3, "area": 0, "thickness": 0, "thinning": 0}
-sheet_stress_adjoint = vjp(sheet_stress, {"F": 9, "n": 3, "mu": 0, "P": 9, **_SHAPED}, ("F", "mu", "P", *_SHAPED))
 
 
 @triton.jit

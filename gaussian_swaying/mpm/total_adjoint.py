@@ -11,8 +11,10 @@ each in four columns of eight. Rows of ``history``: displacement and velocity at
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import torch
@@ -23,18 +25,54 @@ from gaussian_swaying.kernels.derive import vjp
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.kernels.launch import lanes, launch
 from gaussian_swaying.mpm.damping import kelvin_voigt
-from gaussian_swaying.mpm.dispatch import pk1, pk1_adjoint
+from gaussian_swaying.mpm.device_functions import device_key
+from gaussian_swaying.mpm.dispatch import BodyLaws, pk1, pk1_adjoint
 from gaussian_swaying.mpm.forces import Force, divide, tensors_of
 from gaussian_swaying.mpm.run import MAX_STEPS, at_home
 from gaussian_swaying.mpm.shared_kernels import VARIES, axis_weights, node_weight, numbers_of_force, sums, vector
-from gaussian_swaying.mpm.sheets import flattened, flattened_adjoint, sheet_stress_adjoint, without_normal
+from gaussian_swaying.mpm.sheets import flattened, sheet_stress, without_normal
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.timestep import kick_time
 from gaussian_swaying.mpm.total_kernels import cells_of, gather, law_row, load_particles, motion
 from gaussian_swaying.mpm.total_run import REGISTERS, TotalRun
 from gaussian_swaying.mpm.transfer import gather as gather_rows
 
-kelvin_voigt_adjoint = vjp(kelvin_voigt, {"F": 9, "rate": 9, "mu": 0, "lam": 0, "time": 0}, ("F", "rate", "mu", "lam"))
+_SHAPED = {"flat": 9, "m": 3, "area": 0, "thickness": 0, "thinning": 0}
+
+
+class Adjoints:
+    """The adjoints of what a body and its force are computed by, derived when a gradient is first wanted.
+
+    Args:
+        laws: The laws.
+        force: What makes the adjoint of the force, see ``DeviceFunction``; None without force.
+    """
+
+    def __init__(self, laws: BodyLaws, force: Callable[[], Any] | None) -> None:
+        self.stresses = laws.adjoints
+        self.force = None if force is None else force()
+        self.viscous, self.flattened, self.sheet = _derived()
+        functions = (*self.stresses, self.force, self.viscous, self.flattened, self.sheet)
+        self.cache_key = hashlib.sha256(repr(list(map(device_key, functions))).encode()).hexdigest()
+
+    def __repr__(self) -> str:
+        return f"Adjoints_{self.cache_key[:16]}"  # part of the names and keys of compiled functions
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Adjoints) and self.cache_key == other.cache_key
+
+    def __hash__(self) -> int:
+        return hash(self.cache_key)
+
+
+@cache
+def _derived() -> tuple[Any, ...]:
+    """The adjoints of ``kelvin_voigt``, ``flattened`` and ``sheet_stress``."""
+    return (
+        vjp(kelvin_voigt, {"F": 9, "rate": 9, "mu": 0, "lam": 0, "time": 0}, ("F", "rate", "mu", "lam")),
+        vjp(flattened, {"F": 9, "n": 3, "mu": 0, "lam": 0}, ("F", "mu", "lam")),
+        vjp(sheet_stress, {"F": 9, "n": 3, "mu": 0, "P": 9, **_SHAPED}, ("F", "mu", "P", *_SHAPED)),
+    )
 
 
 @triton.jit(do_not_specialize=VARIES)
@@ -75,7 +113,7 @@ def particles_adjoint(
     sx, sy, inverse_dx, viscous_time,
     LAWS: tl.constexpr, MULTI: tl.constexpr, FORCES: tl.constexpr, VISCOUS: tl.constexpr, MATERIAL: tl.constexpr,
     SHARES: tl.constexpr, WIDTH: tl.constexpr, CELLS: tl.constexpr, LANES: tl.constexpr,
-    VIRTUAL: tl.constexpr, SHEETS: tl.constexpr,
+    VIRTUAL: tl.constexpr, SHEETS: tl.constexpr, ADJOINTS: tl.constexpr,
 ):  # fmt: skip
     """Gradients by the nodal displacements (columns 0 to 2 of ``partial``) and velocities (4 to 6), summed by cells.
 
@@ -107,18 +145,18 @@ def particles_adjoint(
             n = load3(normals, count, index, mask)
             F, m, area, thickness, thinning = flattened(bent, n, mu, lam)
             P = pk1(F, mu, lam, row, LAWS)
-            by_bent, more_mu, by_P, by_shape, by_m, by_area, by_thickness, by_thinning = sheet_stress_adjoint(
+            by_bent, more_mu, by_P, by_shape, by_m, by_area, by_thickness, by_thinning = ADJOINTS.sheet(
                 bent, n, mu, P, F, m, area, thickness, thinning, Q
             )
-            by_F, by_mu, by_lam = pk1_adjoint(F, by_P, mu, lam, row, LAWS)
+            by_F, by_mu, by_lam = pk1_adjoint(F, by_P, mu, lam, row, ADJOINTS)
             by_F = axpy9(1.0, by_F, 1.0, by_shape)
             by_mu += more_mu
             rate = without_normal(rate, n)
             Q = without_normal(Q, n)
         else:
-            by_F, by_mu, by_lam = pk1_adjoint(F, Q, mu, lam, row, LAWS)
+            by_F, by_mu, by_lam = pk1_adjoint(F, Q, mu, lam, row, ADJOINTS)
         if VISCOUS:
-            more, by_rate, one, two = kelvin_voigt_adjoint(F, rate, mu, lam, viscous_time, Q)
+            more, by_rate, one, two = ADJOINTS.viscous(F, rate, mu, lam, viscous_time, Q)
             by_F = axpy9(1.0, by_F, 1.0, more)
             by_mu += one
             by_lam += two
@@ -132,7 +170,7 @@ def particles_adjoint(
             point, own, now = numbers_of_force(
                 0, FORCES, index, mask, scene, values, count, vectors, scenes, step, numbers
             )
-            more, by_v, by_vector, by_numbers = FORCES.adjoints[0](F, v, point, own, now, numbers + FORCES.tables[0], a)
+            more, by_v, by_vector, by_numbers = ADJOINTS.force(F, v, point, own, now, numbers + FORCES.tables[0], a)
             by_F = axpy9(1.0, by_F, 1.0, more)
             if SHARES:
                 to = shares + (step.to(tl.int64) * cells + cell) * 8
@@ -141,7 +179,7 @@ def particles_adjoint(
                     _add(to + 4 + c, tl.sum(tl.where(mask, by_numbers[c], 0.0), 1), real, chunk)
         if SHEETS:
             bars = scale3(-volume, by_m) + (-volume * by_area, -volume * by_thickness, -volume * by_thinning)
-            by_F, one, two = flattened_adjoint(bent, n, mu, lam, by_F + bars)
+            by_F, one, two = ADJOINTS.flattened(bent, n, mu, lam, by_F + bars)
             by_F = axpy9(1.0, by_F, -volume, by_bent)
             by_mu += one
             by_lam += two
@@ -434,7 +472,9 @@ class TotalAdjoint(TotalRun):
         """Gradients by the inputs of :class:`_Rollout`, by name, from those by the nodal fields at the end."""
         loaded = len(run.forces) > 0
         self.asked = ()
-        self.options = self.options_for(divide(run.forces)[1])
+        acting = divide(run.forces)[1]
+        self.options = self.options_for(acting)
+        self.adjoints = Adjoints(self.laws, acting[0].adjoint if acting else None)
         if numbers is not None:
             self.loads.tables.buffer[: len(numbers)].copy_(numbers)
         self._make_room(run.every, loaded)
@@ -508,7 +548,7 @@ class TotalAdjoint(TotalRun):
             self._node_stages(offset)
             self._particles_back(offset)
 
-        key = (*self.options.values(), *self.flags.values(), self.made)
+        key = (*self.options.values(), *self.flags.values(), self.adjoints, self.made)
         self.repeat(count, ("again", *key), again)
         self._keep(0)
         if self.flags["WEIGHTS"]:
@@ -593,7 +633,7 @@ class TotalAdjoint(TotalRun):
             ny * nz, nz, 1 / self.grid.dx, self.settings.stiffness_damping,
             LAWS=self.laws, MULTI=options["MULTI"], FORCES=options["FORCES"], VISCOUS=options["VISCOUS"],
             MATERIAL=flags["MATERIAL"], SHARES=flags["SHARES"], WIDTH=self.width, CELLS=per_program, LANES=self.lanes,
-            VIRTUAL=self.virtual, SHEETS=self.bent > 0, num_warps=1,
+            VIRTUAL=self.virtual, SHEETS=self.bent > 0, ADJOINTS=self.adjoints, num_warps=1,
             **({"maxnreg": REGISTERS} if self.lanes == 64 else {}),
         )  # fmt: skip
         if cut:

@@ -871,7 +871,7 @@ class WindForce(Force):
             per_substep=Numbers(width, partial(self._with_effects, parts) if parts else self.winds),
             implicit=implicit,
             parts=parts,
-            adjoint=force_adjoint(groups, law) if self.uniform and not implicit else None,
+            adjoint=partial(force_adjoint, groups, law) if self.uniform and not implicit else None,
             **patches,
         )
 
