@@ -52,9 +52,18 @@ def main():
     module.launch, module.wide = launch, lambda device: True
     module.lanes, module.compiles = lambda device, gpu, cpu=8: gpu, lambda device: True
 
-    from mpm.kernels.bodies import DT, make_load, make_points, make_solver, set_going
+    from mpm.kernels.bodies import DT, make_load, make_points, make_solver, noise, set_going
     from mpm.kernels.test_agreement import BOUNDARIES
 
+    if sys.argv[1:] == ["gradient"]:
+        # a gradient through sheets with viscosity, pins and wind
+        normal = torch.nn.functional.normalize(noise(7, 12, 3), dim=-1)
+        bending = torch.full((12,), 1e-3, requires_grad=True)
+        points = make_points("cpu", count=12, normal=normal, bending=bending)
+        solver = make_solver("kernels", "total", boundaries=BOUNDARIES["two pins"](), stiffness_damping=1e-3)
+        with contextlib.suppress(ValueError, FloatingPointError):
+            solver.rollout(set_going(solver, points), DT, 3, make_load(points), check=False).position.sum().backward()
+        return
     for formulation, boundaries in (("updated", "walls and pins"), ("updated", "handle"), ("total", "two pins")):
         points = make_points("cpu", count=12, batch=(2,))
         solver = make_solver("kernels", formulation, boundaries=BOUNDARIES[boundaries]())

@@ -37,15 +37,22 @@ def test_the_blocks_of_a_gpu_do_what_torch_does():
 
 PROGRAM = Path(__file__).with_name("compile_for_a_gpu.py")
 KERNELS = {
-    *("updated_load", "updated_particles", "updated_pin", "updated_nodes", "updated_read", "pin_mass"),
-    *("total_particles", "total_nodes", "total_read"),
+    "rollouts": {
+        *("updated_load", "updated_particles", "updated_pin", "updated_nodes", "updated_read", "pin_mass"),
+        *("total_particles", "total_nodes", "total_read"),
+    },
+    "gradient": {
+        *("total_particles", "total_nodes", "total_read", "total_bend"),
+        *("keep_nodes", "nodes_adjoint", "particles_adjoint", "bend_adjoint"),
+    },
 }
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="the GPU runs the kernels")
-def test_the_kernels_of_rollouts_compile(tmp_path):
+@pytest.mark.parametrize("part", ["rollouts", pytest.param("gradient", marks=pytest.mark.slow)])
+def test_the_kernels_compile(part, tmp_path):
     pytest.importorskip("triton", reason="needs triton, which is available on Linux only")
     given = {**os.environ, "TRITON_CACHE_DIR": str(tmp_path), "TRITON_INTERPRET": "0"}
-    made = subprocess.run([sys.executable, str(PROGRAM)], env=given, capture_output=True, text=True, check=False)
+    made = subprocess.run([sys.executable, str(PROGRAM), part], env=given, capture_output=True, text=True, check=False)
     assert made.returncode == 0, made.stderr
-    assert set(made.stdout.split()) == KERNELS
+    assert set(made.stdout.split()) == KERNELS[part]
