@@ -79,9 +79,8 @@ class DeviceFunction:
 class Compilable(Fixed):
     """Base of components that may have a device function.
 
-    A subclass does not inherit it, because it may compute something else.
-
-    One that computes the same says ``device_function = Base.device_function``.
+    A subclass does not inherit it, because it may compute something else. One that computes the same says
+    ``device_function = Base.device_function``.
     """
 
     def __init_subclass__(cls, **settings: Any) -> None:
@@ -102,14 +101,33 @@ class Compilable(Fixed):
         return found
 
 
-class Composed:
+class Constant:
+    """Base of objects that are constants of compiled kernels: two are the same if their ``cache_key`` is.
+
+    Attributes:
+        cache_key: Changes with the source of the functions, for the caches of Triton.
+    """
+
+    cache_key: str
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}_{self.cache_key[:16]}"  # part of the names and keys of compiled functions
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self) and repr(other) == repr(self)
+
+    def __hash__(self) -> int:
+        return hash(self.cache_key)
+
+
+class Composed(Constant):
     """Several device functions, and where each finds its numbers, as one constant of a compiled kernel.
 
     Args:
         given: The device functions.
 
     Attributes:
-        functions: Their device functions.
+        functions: The functions themselves.
         options: The options of each, and its parts.
         per_point: First and number of the numbers of a point, for each device function; the others likewise.
         numbers: Those of all points.
@@ -118,7 +136,6 @@ class Composed:
         parts: The parts of each.
         size: Length of all numbers and tables in one buffer, the numbers first.
         width: Length of a row of the numbers of a substep, a multiple of 16.
-        cache_key: Changes with the source of the functions, for the caches of Triton.
     """
 
     def __init__(self, given: Sequence[DeviceFunction]) -> None:
@@ -136,15 +153,6 @@ class Composed:
         functions = [device_key(function) for function in self.functions]
         layout = (self.options, self.per_point, self.numbers, self.per_substep, self.tables, self.size)
         self.cache_key = hashlib.sha256(repr((functions, layout)).encode()).hexdigest()
-
-    def __repr__(self) -> str:
-        return f"DeviceFunctions_{self.cache_key[:16]}"  # part of the names and keys of compiled functions
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Composed) and self.cache_key == other.cache_key
-
-    def __hash__(self) -> int:
-        return hash(self.cache_key)
 
 
 def _places(counts: Any) -> tuple[tuple[int, int], ...]:

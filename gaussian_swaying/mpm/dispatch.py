@@ -17,7 +17,7 @@ from torch import Tensor
 from gaussian_swaying.geometry.linalg_triton import matmul, scaled_product, svd3, transpose, where3, where9
 from gaussian_swaying.kernels.derive import device_function, on_tensors
 from gaussian_swaying.kernels.language import tl, triton
-from gaussian_swaying.mpm.device_functions import device_key
+from gaussian_swaying.mpm.device_functions import Constant, device_key
 from gaussian_swaying.mpm.laws.law import NUMBERS, ConstitutiveLaw, DeviceLaw, lame_parameters
 from gaussian_swaying.mpm.state import MaterialPoints
 
@@ -115,7 +115,7 @@ def _as_tuple(found: Tensor | tuple[Tensor, Tensor | None], internal: Tensor | N
     return (first,) if second is None else (first, second)
 
 
-class BodyLaws:
+class BodyLaws(Constant):
     """The device functions of the laws of a body, each one once.
 
     It is passed to the kernels as a constant; they read its attributes when they are compiled.
@@ -130,7 +130,6 @@ class BodyLaws:
         matrices: Functions of first Piola-Kirchhoff stresses that come from F itself, numbered after those.
         flows: Functions of the plastic flow.
         all_flow: Whether every law flows.
-        cache_key: Changes with the source of the functions, for the caches of Triton.
     """
 
     def __init__(self, laws: Sequence[ConstitutiveLaw]) -> None:
@@ -160,9 +159,6 @@ class BodyLaws:
     def adjoints(self) -> tuple[Any, ...]:
         """Gradients of the stresses in the order of their numbers, derived when they are first wanted."""
         return tuple(device.adjoint for device in self._sources)
-
-    def __repr__(self) -> str:
-        return f"Laws_{self.cache_key[:16]}"  # part of the names and keys of compiled functions
 
 
 def _once(functions: Any) -> tuple[Any, ...]:

@@ -187,11 +187,7 @@ def tensors_of(forces: Sequence[Force]) -> list[Tensor]:
 
 def divide(forces: Sequence[Force]) -> tuple[tuple[Force, ...], list[DeviceFunction], tuple[Force, ...]]:
     """The forces that have a device function, their device functions, and the others, which run in torch."""
-    device_functions = [force.device_function() for force in forces]
-    fused = tuple(
-        force for force, device_function in zip(forces, device_functions, strict=True) if device_function is not None
-    )
-    asked = tuple(
-        force for force, device_function in zip(forces, device_functions, strict=True) if device_function is None
-    )
-    return fused, [device_function for device_function in device_functions if device_function is not None], asked
+    found = [(force, force.device_function()) for force in forces]
+    fused = tuple(force for force, own in found if own is not None)
+    asked = tuple(force for force, own in found if own is None)
+    return fused, [own for _, own in found if own is not None], asked

@@ -25,7 +25,7 @@ from gaussian_swaying.kernels.derive import vjp
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.kernels.launch import lanes, launch
 from gaussian_swaying.mpm.damping import kelvin_voigt
-from gaussian_swaying.mpm.device_functions import device_key
+from gaussian_swaying.mpm.device_functions import Constant, device_key
 from gaussian_swaying.mpm.dispatch import BodyLaws, pk1, pk1_adjoint
 from gaussian_swaying.mpm.forces import Force, divide, tensors_of
 from gaussian_swaying.mpm.run import MAX_STEPS, at_home
@@ -40,7 +40,7 @@ from gaussian_swaying.mpm.transfer import gather as gather_rows
 _SHAPED = {"flat": 9, "m": 3, "area": 0, "thickness": 0, "thinning": 0}
 
 
-class Adjoints:
+class Adjoints(Constant):
     """The adjoints of what a body and its force are computed by, derived when a gradient is first wanted.
 
     Args:
@@ -54,15 +54,6 @@ class Adjoints:
         self.viscous, self.flattened, self.sheet = _derived()
         functions = (*self.stresses, self.force, self.viscous, self.flattened, self.sheet)
         self.cache_key = hashlib.sha256(repr(list(map(device_key, functions))).encode()).hexdigest()
-
-    def __repr__(self) -> str:
-        return f"Adjoints_{self.cache_key[:16]}"  # part of the names and keys of compiled functions
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Adjoints) and self.cache_key == other.cache_key
-
-    def __hash__(self) -> int:
-        return hash(self.cache_key)
 
 
 @cache
