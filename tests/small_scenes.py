@@ -125,10 +125,10 @@ def started(found, cloud, folder):
     return Simulation.from_yaml(folder / "starter.yaml", device="cpu")
 
 
-def previewed(cloud, folder, *options):
+def previewed(cloud, folder, *options, up="--up=+z"):
     write_ply(folder / "it.ply", cloud)
-    given = [str(folder / "it.ply"), "--up", "+z", "--device", "cpu", "--quality", "draft", "--height", "96", *options]
-    preview = preview_scene(build_options().parse_args(given), folder)
+    given = [str(folder / "it.ply"), up, "--device", "cpu", "--quality", "draft", "--height", "96", *options]
+    preview = preview_scene(build_options().parse_args(list(filter(None, given))), folder)
     write(preview, folder)
     return preview, Simulation.from_yaml(folder / "starter.yaml", device="cpu")
 

@@ -5,99 +5,12 @@ import math
 
 import pytest
 import torch
-from shared import unit
 from small_scenes import plain_cloud, together
+from things import AWAY, ball, block, guitar_on_a_stand, lamp, man, plant_in_a_pot, splat, tube
 
 from gaussian_swaying.preview.hold import cord_heights, guess_hold
 from gaussian_swaying.preview.suggest import CELLS, suggest, visible_weight
 from gaussian_swaying.scenes.procedural import FlagScene
-
-
-def tube(low, high, radius, count=600, end=None, seed=0):
-    """Points on a tube between two points, its radius ``end`` at the upper one, with both caps."""
-    draw = torch.Generator().manual_seed(seed)
-    low, high = torch.tensor(low), torch.tensor(high)
-    axis = torch.nn.functional.normalize(high - low, dim=0)
-    first = torch.linalg.cross(axis, torch.eye(3)[int(axis.abs().argmin())])
-    first = torch.nn.functional.normalize(first, dim=0)
-    second = torch.linalg.cross(axis, first)
-    share, angle = torch.rand(count, generator=draw), 2 * math.pi * torch.rand(count, generator=draw)
-    inner = torch.ones(count)
-    caps = count // 5
-    share[:caps] = torch.arange(caps) % 2
-    inner[:caps] = torch.rand(caps, generator=draw).sqrt()
-    reach = inner * (radius + share * ((radius if end is None else end) - radius))
-    ring = angle.cos()[:, None] * first + angle.sin()[:, None] * second
-    return low + share[:, None] * (high - low) + reach[:, None] * ring
-
-
-def ball(center, radius, count=600, seed=0):
-    """Points on a sphere."""
-    draw = torch.Generator().manual_seed(seed)
-    return torch.tensor(center) + radius * unit(count, 3, generator=draw, dtype=torch.float32)
-
-
-def block(low, high, count=1500, seed=0):
-    """Points on the six sides of a box."""
-    draw = torch.Generator().manual_seed(seed)
-    unit = torch.rand(count, 3, generator=draw)
-    side = torch.arange(count) % 3
-    unit[torch.arange(count), side] = (torch.arange(count) // 3 % 2).float()
-    low, high = torch.tensor(low), torch.tensor(high)
-    return low + unit * (high - low)
-
-
-def splat(*parts, move=(0.0, 0.0, 0.0)):
-    """Points as round, opaque Gaussians."""
-    return plain_cloud(torch.cat(parts) + torch.tensor(move), math.log(0.02), logit=2.0)
-
-
-def man():
-    """1.8 high, in a stride, with a torso wider than the legs, a neck and a head, the origin between the feet."""
-    return [
-        block([0.05, -0.05, 0.0], [0.17, 0.25, 0.08]),
-        block([-0.17, -0.3, 0.0], [-0.05, 0.0, 0.08]),
-        tube([0.11, 0.05, 0.0], [0.1, 0.0, 0.9], 0.07),
-        tube([-0.11, -0.2, 0.0], [-0.1, 0.0, 0.9], 0.07),
-        tube([0.0, 0.0, 0.85], [0.0, 0.0, 1.5], 0.2, 1200),
-        tube([0.25, 0.0, 0.85], [0.25, 0.0, 1.45], 0.05),
-        tube([-0.25, 0.0, 0.85], [-0.25, 0.0, 1.45], 0.05),
-        tube([0.0, 0.0, 1.45], [0.0, 0.0, 1.6], 0.06, 200),
-        ball([0.0, 0.0, 1.68], 0.12),
-    ]
-
-
-def guitar_on_a_stand():
-    """1 high: a stand of three feet, a body and a long thin neck with a head, which lean back."""
-    return [
-        tube([0.0, 0.12, 0.35], [-0.18, -0.15, 0.0], 0.015, 300),
-        tube([0.0, 0.12, 0.35], [0.18, -0.15, 0.0], 0.015, 300),
-        tube([0.0, 0.12, 0.35], [0.0, 0.22, 0.0], 0.015, 300),
-        tube([0.0, -0.06, 0.08], [0.0, 0.02, 0.48], 0.16, 2500, 0.1),
-        tube([0.0, 0.02, 0.48], [0.0, 0.13, 0.9], 0.018, 800),
-        block([-0.04, 0.12, 0.9], [0.04, 0.15, 1.0], 300),
-    ]
-
-
-def plant_in_a_pot():
-    """A pot that widens upwards, a stem and a crown; the origin somewhere else."""
-    return [
-        tube([0.0, 0.0, 0.0], [0.0, 0.0, 0.2], 0.1, 900, 0.14),
-        tube([0.0, 0.0, 0.18], [0.0, 0.0, 0.6], 0.015, 400),
-        ball([0.0, 0.0, 0.7], 0.25, 1500),
-    ]
-
-
-def lamp(shade="bulb"):
-    """A bulb or a conical shade on a cord 0.6 long, under a small plate at the ceiling."""
-    body = ball([0.0, 0.0, 0.12], 0.12, 1200)
-    if shade == "cone":
-        body = tube([0.0, 0.0, 0.0], [0.0, 0.0, 0.25], 0.25, 1500, 0.03)
-    return [
-        body,
-        tube([0.0, 0.0, 0.2], [0.0, 0.0, 0.9], 0.006, 600),
-        tube([0.0, 0.0, 0.88], [0.0, 0.0, 0.92], 0.04, 300),
-    ]
 
 
 def ground(low=-0.06, half=1.0, step=0.05):
@@ -112,9 +25,6 @@ def flag(move=(0.0, 0.0, 0.0)):
     """The generated flag, its pole at x = 0."""
     cloud = FlagScene(spacing=0.05).generate()
     return dataclasses.replace(cloud, means=cloud.means + torch.tensor(move))
-
-
-AWAY = (3.0, 4.0, 5.0)
 
 
 def held(cloud):

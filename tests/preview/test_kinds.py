@@ -5,59 +5,20 @@ import math
 
 import pytest
 import torch
-from small_scenes import GREEN, coloured, plain_cloud, together
+from small_scenes import GREEN
+from things import AWAY, BLUE, GREY, SKIN, cone, figure, full, painted, small_tree, tuft
 
 from gaussian_swaying.mpm.materials import MATERIALS
 from gaussian_swaying.preview.kinds import KINDS, STEM_E
 from gaussian_swaying.preview.suggest import suggest
 from gaussian_swaying.scenes.alocasia import AlocasiaScene
-from gaussian_swaying.scenes.ficus import FicusScene
 from gaussian_swaying.scenes.flag_on_stand import FlagOnStandScene
 from gaussian_swaying.scenes.procedural import FlagScene
-
-GREY, SKIN, BLUE = (0.5,) * 3, (0.8, 0.6, 0.45), (0.2, 0.25, 0.6)
-AWAY = torch.tensor([3.0, 4.0, 0.0])  # an origin far from the thing says nothing about its ends
-
-
-def painted(means, color, scales=-4.0):
-    return coloured(plain_cloud(means, scales), color)
-
-
-def draws(*shape, seed=0):
-    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
-
-
-def block(low, high, color, count=1500, seed=0, scales=-4.0):
-    low, high = torch.tensor(low), torch.tensor(high)
-    return painted(low + (high - low) * draws(count, 3, seed=seed), color, scales)
-
-
-def figure(head, clothes=BLUE):
-    """A head on shoulders on legs, 1.75 m high."""
-    return together(
-        block([-0.1, -0.1, 1.45], [0.1, 0.1, 1.75], head, 600),
-        block([-0.25, -0.12, 0.8], [0.25, 0.12, 1.45], clothes, 2500, 1),
-        block([-0.2, -0.1, 0.0], [0.2, 0.1, 0.8], clothes, 2500, 2),
-    )
-
-
-def cone():
-    z = 1 - draws(6000).sqrt()
-    angle, radius = 2 * math.pi * draws(6000, seed=1), 0.35 * (1 - z)
-    return painted(torch.stack([radius * angle.cos(), radius * angle.sin(), z], -1), GREEN)
-
-
-def tuft():
-    """Thin blades from one base."""
-    blade, share = (80 * draws(6000)).long(), draws(6000, seed=1)
-    angle, lean = 2 * math.pi * draws(80, seed=2)[blade], 0.15 + 0.25 * draws(80, seed=3)[blade]
-    out = 0.02 + lean * share**2
-    return painted(torch.stack([out * angle.cos(), out * angle.sin(), 0.5 * share], -1), GREEN, (-6.0, -6.0, -3.5))
 
 
 def kind(cloud, **given):
     given.setdefault("up", "+z")
-    return suggest(dataclasses.replace(cloud, means=cloud.means + AWAY), **given)
+    return suggest(dataclasses.replace(cloud, means=cloud.means + torch.tensor(AWAY)), **given)
 
 
 @pytest.mark.parametrize(
@@ -69,11 +30,11 @@ def kind(cloud, **given):
         ("person", lambda: figure((0.35, 0.25, 0.17)), {"hold": "bottom"}),
         ("rigid", lambda: figure(GREY, GREY), {"hold": "bottom"}),
         ("rigid", lambda: figure(BLUE), {"hold": "bottom"}),
-        ("rigid", lambda: block([0, 0, 0], [0.5, 0.4, 0.6], GREY), {"hold": "bottom"}),
-        ("shrub", lambda: block([0, 0, 0], [0.5, 0.5, 0.6], GREEN), {"hold": "bottom"}),
+        ("rigid", lambda: painted(full([0, 0, 0], [0.5, 0.4, 0.6]), GREY), {"hold": "bottom"}),
+        ("shrub", lambda: painted(full([0, 0, 0], [0.5, 0.5, 0.6]), GREEN), {"hold": "bottom"}),
         ("conifer", cone, {"hold": "bottom"}),
         ("grass", tuft, {"hold": "bottom"}),
-        ("hanging", lambda: block([0, 0, 0], [0.3, 0.3, 1.0], GREY), {"hold": "top"}),
+        ("hanging", lambda: painted(full([0, 0, 0], [0.3, 0.3, 1.0]), GREY), {"hold": "top"}),
     ],
 )  # fmt: skip
 def test_a_thing_is_of_its_kind(name, make, given):
@@ -86,7 +47,7 @@ def test_a_thing_is_of_its_kind(name, make, given):
 
 def test_gold_is_no_leaf():
     """Yellow is greener than blue, and as green as red."""
-    found = kind(block([0, 0, 0], [0.5, 0.5, 0.6], (0.7, 0.65, 0.2)), hold="bottom")
+    found = kind(painted(full([0, 0, 0], [0.5, 0.5, 0.6]), (0.7, 0.65, 0.2)), hold="bottom")
     assert found.kind == "rigid"
 
 
@@ -101,9 +62,7 @@ def test_a_plant_in_a_pot_and_a_tree():
     assert stems["stem"].damping_ratio == stems["leaf"].damping_ratio == KINDS["plant"].damping_ratio
     assert stems["leaf"].density == MATERIALS["leaf"].density
     assert stems["pot"].density is None
-    ficus = FicusScene(spacing=0.02).generate()
-    tree = ficus.select((ficus.means[:, :2].norm(dim=-1) < 0.9) & (ficus.means[:, 2] > 0.32))
-    assert suggest(tree, up="+z").kind == "tree"
+    assert suggest(small_tree(), up="+z").kind == "tree"
     assert suggest(FlagOnStandScene(spacing=0.025).generate(), up="+z").kind == "flag"
 
 
@@ -118,7 +77,7 @@ def test_the_ground_around_a_plant_is_no_part_of_its_size():
 
 
 def test_a_kind_may_be_given():
-    cloud = block([0, 0, 0], [0.5, 0.4, 0.6], GREY)
+    cloud = painted(full([0, 0, 0], [0.5, 0.4, 0.6]), GREY)
     found = kind(cloud, hold="bottom", kind="shrub")
     assert (found.kind, found.kind_reason, found.longest_side) == ("shrub", "given", pytest.approx(1.2))
     assert kind(cloud, hold="bottom", kind="shrub", longest_side=3.0).longest_side == pytest.approx(3.0)

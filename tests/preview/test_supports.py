@@ -6,14 +6,19 @@ import pytest
 import torch
 from shared import unit
 from small_scenes import coloured, plain_cloud, started
+from things import sign, small_tree, washing_line
 
 from gaussian_swaying.preview.suggest import suggest, visible_weight
 from gaussian_swaying.preview.supports import flag_on_pole, sheet_between_posts, standing_parts
-from gaussian_swaying.scenes.ficus import FicusScene
 from gaussian_swaying.scenes.flag_on_stand import FlagOnStandScene
 from gaussian_swaying.scenes.procedural import FlagScene
 
 UP = (0.0, 0.0, 1.0)
+
+
+@pytest.fixture(scope="module")
+def tree():
+    return small_tree(0.01)
 
 
 def all_of(cloud):
@@ -29,13 +34,6 @@ def lamp(radius=0.006):
     ball = unit(1200, 3, generator=draw, dtype=torch.float32) * 0.12
     ball[:, 2] += 0.12
     return plain_cloud(torch.cat([cord, plate, ball]) + torch.tensor([3.0, 4.0, 5.0]), -4.0, logit=2.0)
-
-
-@pytest.fixture(scope="module")
-def tree():
-    """A tree without its pot, 1.6 m high, its lowest branches at a quarter of it."""
-    cloud = FicusScene(spacing=0.01).generate()
-    return cloud.select((cloud.means[:, :2].norm(dim=-1) < 0.9) & (cloud.means[:, 2] > 0.32))
 
 
 @pytest.mark.parametrize("yaw", [0.0, 30.0, 200.0])
@@ -94,24 +92,6 @@ def test_the_starter_moves_the_cloth_and_not_the_pole(tmp_path):
     assert suggest(cloud, up="+z", hold="-x").parts is None
 
 
-def washing_line(posts=(0.0, 2.0)):
-    """A towel on a line of 2 m between posts of 1.8 m with feet and arms."""
-    draw = torch.Generator().manual_seed(0)
-
-    def box(count, low, high):
-        low, high = torch.tensor(low), torch.tensor(high)
-        return low + (high - low) * torch.rand(count, 3, generator=draw)
-
-    towel = box(6000, [0.6, -0.005, 0.6], [1.4, 0.005, 1.65])
-    line = box(400, [0.0, -0.005, 1.65], [2.0, 0.005, 1.67])
-    rest = []
-    for x in posts:
-        rest.append(box(900, [x - 0.03, -0.03, 0.0], [x + 0.03, 0.03, 1.8]))
-        rest.append(box(200, [x - 0.15, -0.15, 0.0], [x + 0.15, 0.15, 0.05]))  # foot
-        rest.append(box(200, [x - 0.03, -0.3, 1.75], [x + 0.03, 0.3, 1.8]))  # arm
-    return torch.cat([towel, line]), torch.cat([towel, line, *rest])
-
-
 def test_posts_of_a_washing_line_stand():
     moving, means = washing_line()
     cloud = plain_cloud(means, -4.0, logit=2.0)
@@ -160,17 +140,6 @@ def test_a_tree(tree):
     assert float(parts.mask("leaf")[z > 1.5].double().mean()) > 0.9
     assert guess.pin is None
     assert guess.hold.end == "bottom"
-
-
-def sign(width=0.03):
-    """A round plate of 0.6 m on a post of 1.5 m."""
-    draw = torch.Generator().manual_seed(0)
-    angle, share = 6.2832 * torch.rand(1500, generator=draw), torch.rand(1500, generator=draw)
-    post = torch.stack([width * angle.cos(), width * angle.sin(), 1.5 * share], -1)
-    plate = torch.stack(
-        [0.3 * share.sqrt() * angle.sin(), 0.02 * angle.cos(), 1.7 + 0.3 * share.sqrt() * angle.cos()], -1
-    )
-    return plain_cloud(torch.cat([post, plate]) + torch.tensor([3.0, 4.0, 0.0]), -4.0, logit=2.0)
 
 
 def test_a_sign_on_a_post():
