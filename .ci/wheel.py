@@ -168,8 +168,8 @@ def main() -> None:
     assert code == 2, told
     assert "add --splat" in told, told
     tried.add("fit")
-    needs("fit", "register run/frames/00001.png flag.ply --output=other")
-    tried.add("register")
+    needs("fit", "camera run/frames/00001.png flag.ply --output=other")
+    tried.add("camera")
     needs("viewer", "live --no-browser")
     tried.add("live")
     os.environ["CUDA_VISIBLE_DEVICES"] = ""

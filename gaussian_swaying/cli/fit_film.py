@@ -16,8 +16,8 @@ from torch import Tensor
 
 from gaussian_swaying import _program as program
 from gaussian_swaying._files import write_json, write_text
+from gaussian_swaying.cli.camera import CAMERAS, PICTURE, STILLS, VIEW, first_cameras, fov_of, painter_of, transforms
 from gaussian_swaying.cli.preview import build_options, preview_scene, up_of
-from gaussian_swaying.cli.register import CAMERAS, PICTURE, STILLS, VIEW, first_cameras, fov_of, painter_of, transforms
 from gaussian_swaying.fitting.film import Film, begins_to_move, first_frame, open_film, pixels_of_focal
 from gaussian_swaying.fitting.held import held_end, moving_box, moving_points
 from gaussian_swaying.fitting.scale import SCALE
@@ -76,7 +76,7 @@ def prepare(options: argparse.Namespace, folder: Path) -> Path:
     if options.hold is not None:
         given_hold(options.hold, (0.0, 0.0, 1.0))  # refuses what is no end
     if Path(options.film).suffix.lower() in STILLS:
-        raise ValueError(f"{options.film} is a picture: give a film, or find its camera with `register`.")
+        raise ValueError(f"{options.film} is a picture: give a film, or find its camera with `camera`.")
     seen, sentence = _registered(options, None if options.up is None else _direction(options.up))
     print(sentence, flush=True)
     folder.mkdir(parents=True, exist_ok=True)
@@ -140,7 +140,7 @@ def _length(given: Sequence[str] | None) -> tuple[str, float] | None:
 
 
 def _registered(options: argparse.Namespace, up: Sequence[float] | None) -> tuple[Seen, str]:
-    from gaussian_swaying.fitting.registration import register
+    from gaussian_swaying.fitting.registration import find_camera
     from gaussian_swaying.gaussians.formats import read_gaussians
 
     film = open_film(options.film)
@@ -151,7 +151,7 @@ def _registered(options: argparse.Namespace, up: Sequence[float] | None) -> tupl
         fov = 2 * math.degrees(math.atan(0.5 * film.height / pixels_of_focal(focal, film.width, film.height)))
     start = first_cameras(cloud, up, fov, film.width, film.height)
     try:
-        found = register(draw, frame, start, focal=focal is None)
+        found = find_camera(draw, frame, start, focal=focal is None)
     except ValueError as error:
         raise ValueError(
             f"The splat was not found in the first frame of {options.film}. It has to show the object at rest, large "

@@ -22,7 +22,7 @@ COMMANDS = {
     "sim": ("gaussian_swaying.cli.simulate", "simulate a scene in the wind: splat in, video out"),
     "sweep": ("gaussian_swaying.cli.sweep", "do many runs along axes, with a table and a picture of all"),
     "fit": ("gaussian_swaying.cli.fit", "find the wind and the material from video"),
-    "register": ("gaussian_swaying.cli.register", "find the camera of a film of a splat"),
+    "camera": ("gaussian_swaying.cli.camera", "find the camera of a film of a splat"),
     "live": ("gaussian_swaying.cli.live", "change the wind on a page while a scene moves"),
     "train": ("gaussian_swaying.cli.train", "train surface-aligned Gaussians from photos"),
     "preview": ("gaussian_swaying.cli.preview", "look at a splat and suggest a first configuration"),

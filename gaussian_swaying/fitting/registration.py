@@ -99,7 +99,7 @@ def cameras_around(
     return found
 
 
-def register(
+def find_camera(
     draw: Callable[[Camera], RenderOutput], frame: Tensor, start: Sequence[Camera], *, focal: bool = False
 ) -> Registration:
     """Find the camera of a frame of something that stands still.

@@ -15,10 +15,10 @@ from PIL import Image
 from shared import refused
 
 from gaussian_swaying.cli import fit_film
+from gaussian_swaying.cli.camera import painter_of
 from gaussian_swaying.cli.fit import main
 from gaussian_swaying.cli.fit_film import Seen, extent, longest_side, plan_text, upright_in
 from gaussian_swaying.cli.preview import build_options, preview_scene
-from gaussian_swaying.cli.register import painter_of
 from gaussian_swaying.fitting.before import HELD, MOVING
 from gaussian_swaying.fitting.film import first_frame, open_film
 from gaussian_swaying.fitting.plan import read_plan

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gaussian_swaying import Simulation
-from gaussian_swaying.fitting.registration import cameras_around, register
+from gaussian_swaying.fitting.registration import cameras_around, find_camera
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.scenes.procedural import FlagScene
 
@@ -53,7 +53,7 @@ def _off(camera, truth):
 
 def test_from_a_camera_that_is_near(draw, frame, truth):
     near = look_at_camera([0.7, -2.2, 0.6], [0.55, 0.0, 0.45], UP, FOV, WIDTH, HEIGHT, dtype=torch.float64)
-    found = register(draw, frame, [near])
+    found = find_camera(draw, frame, [near])
     angle, distance = _off(found.camera, truth)
     assert angle < 0.5
     assert distance < 0.01
@@ -63,14 +63,14 @@ def test_from_a_camera_that_is_near(draw, frame, truth):
 
 def test_from_no_camera(draw, frame, truth):
     around = cameras_around(MIDDLE, 2.2, UP, FOV, WIDTH, HEIGHT, count=8, elevations=(10.0,))
-    angle, distance = _off(register(draw, frame, around).camera, truth)
+    angle, distance = _off(find_camera(draw, frame, around).camera, truth)
     assert angle < 0.5
     assert distance < 0.01
 
 
 def test_with_the_focal_length(draw, frame, truth):
     near = look_at_camera([0.7, -2.2, 0.6], MIDDLE, UP, 1.15 * FOV, WIDTH, HEIGHT, dtype=torch.float64)
-    found = register(draw, frame, [near], focal=True).camera
+    found = find_camera(draw, frame, [near], focal=True).camera
     assert float(found.intrinsics[0, 0] / truth.intrinsics[0, 0]) == pytest.approx(1, abs=0.03)
     assert _off(found, truth)[0] < 0.7
 
@@ -84,6 +84,6 @@ def test_cameras_around_look_at_the_middle():
 
 def test_what_cannot_be_found_is_refused(draw, truth):
     with pytest.raises(ValueError, match="was not found in the frame"):
-        register(draw, torch.full((HEIGHT, WIDTH, 3), 90, dtype=torch.uint8), [truth])
+        find_camera(draw, torch.full((HEIGHT, WIDTH, 3), 90, dtype=torch.uint8), [truth])
     with pytest.raises(ValueError, match="the frame's size, 100 x 80"):
-        register(draw, torch.zeros(80, 100, 3, dtype=torch.uint8), [truth])
+        find_camera(draw, torch.zeros(80, 100, 3, dtype=torch.uint8), [truth])

@@ -1,4 +1,4 @@
-"""``gaussian-swaying register``: the files that it writes are what ``fit`` reads, and its answers to bad input."""
+"""``gaussian-swaying camera``: the files that it writes are what ``fit`` reads, and its answers to bad input."""
 
 import json
 import math
@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 from shared import refused
 
-from gaussian_swaying.cli.register import fov_of, main, painter_of
+from gaussian_swaying.cli.camera import fov_of, main, painter_of
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.rendering.cameras.transforms_json import camera_from_transforms

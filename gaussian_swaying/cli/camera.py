@@ -1,4 +1,4 @@
-"""Find the camera of a film: ``gaussian-swaying register FILM SPLAT``."""
+"""Find the camera of a film: ``gaussian-swaying camera FILM SPLAT``."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ STILLS = (".png", ".jpg", ".jpeg")
 def build_parser() -> argparse.ArgumentParser:
     """The options."""
     parser = argparse.ArgumentParser(
-        prog=program.name("register"),
+        prog=program.name("camera"),
         description="Find the camera of a film from a tripod, from its first frame and the splat that it shows, and "
         f"write {CAMERAS}, which `fit` reads, with a picture of the frame beside the splat.",
     )
@@ -49,7 +49,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parse and register.
+    """Parse the options and find the camera.
 
     Returns:
         0 on success, 2 on bad input or if the splat is not found in the film.
@@ -57,18 +57,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     parser = build_parser()
     return run_command(
-        lambda: register_film(parser.parse_args(arguments)),
+        lambda: write_camera(parser.parse_args(arguments)),
         stopped="Stopped; nothing was written.",
         memory="a smaller film",
         arguments=arguments,
     )
 
 
-def register_film(options: argparse.Namespace) -> int:
+def write_camera(options: argparse.Namespace) -> int:
     """Find the camera, write the files, and print how sure it is."""
     from PIL import Image
 
-    from gaussian_swaying.fitting.registration import register
+    from gaussian_swaying.fitting.registration import find_camera
     from gaussian_swaying.gaussians.formats import read_gaussians
 
     if options.fov is not None and not 0 < options.fov < 180:
@@ -78,7 +78,7 @@ def register_film(options: argparse.Namespace) -> int:
     cloud = read_gaussians(options.splat, 0)
     draw = painter_of(cloud)
     start = first_cameras(cloud, options.up, options.fov or VIEW, frame.shape[1], frame.shape[0])
-    found = register(draw, frame, start, focal=options.fov is None)
+    found = find_camera(draw, frame, start, focal=options.fov is None)
     folder = Path(options.output or Path("outputs") / "registered" / film.stem)
     folder.mkdir(parents=True, exist_ok=True)
     shown = (draw(found.camera).color.clamp(0, 1) * 255).round().to(torch.uint8)
