@@ -46,6 +46,9 @@ class Fixed:
         """Close a dataclass."""
         _close(self, "__post_init__", Fixed.__post_init__)
 
+    def __repr__(self) -> str:
+        return described(self)
+
     def __setattr__(self, name: str, value: Any) -> None:
         _check(self, name, value)
         if _settable(self, name):  # a module would become a part of another without passing the setter
@@ -72,6 +75,8 @@ def fixed(kind: type[T]) -> type[T]:
     if "__slots__" not in vars(kind):  # those with slots are made in loops
         kind.__init__ = _closing("__init__", kind.__init__)  # type: ignore[method-assign]
     kind.__setattr__, kind.__delattr__ = assign_to, delete  # type: ignore[method-assign]
+    if hasattr(kind.__repr__, "__wrapped__"):  # that of dataclasses, which shows all numbers of tensors
+        kind.__repr__ = described  # type: ignore[method-assign]
     return kind
 
 
@@ -141,6 +146,26 @@ def fields_of(kind: type) -> list[str]:
     return list(inspect.signature(ours.__init__).parameters)[1:]  # type: ignore[misc]
 
 
+def described(thing: Any) -> str:
+    """The class of an object, and those of its arguments that are not the default."""
+    shown = []
+    for name, argument in inspect.signature(type(thing).__init__).parameters.items():
+        text = _brief(getattr(thing, name, None))
+        if text not in ("None", "[]", _brief(argument.default)):
+            shown.append(f"{name}={text}")
+    return f"{type(thing).__name__}({', '.join(shown)})"
+
+
+def _brief(value: object) -> str:
+    if isinstance(value, torch.Tensor):
+        return _brief(value.tolist()) if value.numel() < 5 else f"{tuple(value.shape)}"
+    if isinstance(value, float):
+        return f"{value:g}"
+    if isinstance(value, list | tuple | nn.ModuleList):
+        return f"[{', '.join(map(_brief, value))}]" if len(value) < 9 else f"{len(value):,} entries"
+    return repr(value)
+
+
 def _refuse(thing: Any, name: str) -> NoReturn:
     kind, fields = type(thing), fields_of(type(thing))
     text = f"`{name}` of {kind.__name__} cannot be assigned, as what runs would not be what is recorded"
@@ -150,7 +175,7 @@ def _refuse(thing: Any, name: str) -> NoReturn:
     live = {f"{place}.{name}", f"forces.{kind.__name__}.{name}"} & LIVE
     if live:
         number = min(live).replace("*", "0")
-        text += f", or between two frames `state = simulation.change(state, {{{number!r}: ...}})`"
+        text += f", or between two frames `simulation.change({number!r}, ...)`"
     raise AttributeError(f"{text}.")
 
 

@@ -63,9 +63,6 @@ class Everything(Region):
 
     recordable = True
 
-    def __repr__(self) -> str:
-        return "Everything()"
-
     def contains(self, points: Tensor) -> Tensor:
         """Return a mask (...) of the points (..., 3) [scene units] that are inside."""
         check_shape("points", points, 3)
@@ -93,9 +90,6 @@ class Box(Region):
             if not low < high:
                 raise ValueError(f"Expected `min` to be below `max` of the box along {axis}, but got {low} and {high}.")
 
-    def __repr__(self) -> str:
-        return f"Box(min={list(self.min)}, max={list(self.max)})"
-
     def contains(self, points: Tensor) -> Tensor:
         """Return a mask (...) of the points (..., 3) [scene units] that are inside."""
         check_shape("points", points, 3)
@@ -120,9 +114,6 @@ class Sphere(Region):
         self.center = check_vector("center", center)
         check_positive("radius", radius)
         self.radius = float(radius)
-
-    def __repr__(self) -> str:
-        return f"Sphere(center={list(self.center)}, radius={self.radius})"
 
     def contains(self, points: Tensor) -> Tensor:
         """Return a mask (...) of the points (..., 3) [scene units] that are inside."""
@@ -157,11 +148,6 @@ class Cylinder(Region):
         check_positive("height", height)
         self.radius, self.height = float(radius), float(height)
 
-    def __repr__(self) -> str:
-        return (
-            f"Cylinder(center={list(self.center)}, axis={list(self.axis)}, radius={self.radius}, height={self.height})"
-        )
-
     def contains(self, points: Tensor) -> Tensor:
         """Return a mask (...) of the points (..., 3) [scene units] that are inside."""
         check_shape("points", points, 3)
@@ -189,9 +175,6 @@ class Union(Region):
         self.regions = list(regions)
         self.recordable = all(region.recordable for region in self.regions)
 
-    def __repr__(self) -> str:
-        return f"Union(regions={self.regions})"
-
     def contains(self, points: Tensor) -> Tensor:
         """Return a mask (...) of the points (..., 3) [scene units] that are inside."""
         inside = self.regions[0].contains(points)
@@ -212,9 +195,6 @@ class Not(Region):
 
     def __init__(self, region: Region) -> None:
         self.region, self.recordable = region, region.recordable
-
-    def __repr__(self) -> str:
-        return f"Not(region={self.region})"
 
     def contains(self, points: Tensor) -> Tensor:
         """Return a mask (...) of the points (..., 3) [scene units] that are inside."""

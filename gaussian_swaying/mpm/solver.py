@@ -627,7 +627,3 @@ class MPMSolver(Fixed, Solver):
     def momenta(self, state: MPMState) -> dict[str, Tensor]:
         """Linear [kg m/s] and angular momentum about the origin [kg m²/s], each of shape (..., 3)."""
         return dict(zip(("linear", "angular"), self.bound.momenta(state), strict=True))
-
-    def extra_repr(self) -> str:
-        """Settings, for printing."""
-        return f"formulation={self.formulation}, dx={self.dx}, gravity={self.gravity}, damping={self.damping}"

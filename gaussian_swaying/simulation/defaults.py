@@ -47,7 +47,7 @@ else:  # what a YAML file can contain: the annotations of the constructor are it
     SceneLike, WindLike, DeviceLike = Scene, WindField, Literal["auto", "cpu", "cuda"]
     SolverLike, MaterialLike = MPMSolver, Material
 
-HoldLike = Region | PinnedRegion | PinnedPoints
+HoldLike = Region | PinnedRegion | PinnedPoints | list[Region | PinnedRegion | PinnedPoints]
 CELLS = 32
 """Largest number of grid cells along the longest side if no solver is given."""
 
@@ -102,12 +102,13 @@ def as_solver(
     captured shape is already in balance with its weight. ``damping`` [1/s] is that of a solver that is made.
     """
     if solver is None:
-        pins = [PinnedRegion(hold) if isinstance(hold, Region) else hold] if hold is not None else []
+        given = list(hold) if isinstance(hold, list | tuple) else [] if hold is None else [hold]
+        pins = [PinnedRegion(part) if isinstance(part, Region) else part for part in given]
         means = cloud.means[scene.select(cloud)]
         frame = SimFrame.fit(means, scene.up, scene.longest_side, scene.metres_per_unit)
         side = float((means.amax(0) - means.amin(0)).amax()) * frame.metres_per_unit
         spacing = particle_spacing(means) * frame.metres_per_unit
-        held = hold is not None or (scene.parts is not None and bool(scene.parts.mask(role="held").any()))
+        held = bool(pins) or (scene.parts is not None and bool(scene.parts.mask(role="held").any()))
         gravity = (0.0, 0.0, 0.0 if held else -9.8)
         return MPMSolver(dx=suggest_spacing(side, spacing, CELLS), gravity=gravity, boundaries=pins, damping=damping)
     if hold is not None:
@@ -168,7 +169,8 @@ def check_types(given: Mapping[str, Any]) -> None:
             raise TypeError(f"Expected `{name}` to be a {words}, but got {shown(value)}.")
         for part in value if name in _LISTS and isinstance(value, list | tuple) else ():
             if not isinstance(part, _LISTS[name]) and not (name == "forces" and callable(part)):
-                raise TypeError(f"Expected `{name}` to be a list of {_LISTS[name].__name__}, but it has {shown(part)}.")
+                words = " or ".join(kind.__name__ for kind in _LISTS[name])
+                raise TypeError(f"Expected `{name}` to be a list of {words}, but it has {shown(part)}.")
 
 
 _KINDS: dict[str, tuple[type, ...]] = {
@@ -186,6 +188,6 @@ _KINDS: dict[str, tuple[type, ...]] = {
     "copies": (list, tuple),
     "recorder": (Recorder,),
     "normalisation": (Normalisation,),
-    "hold": (Region, PinnedRegion, PinnedPoints),
+    "hold": (Region, PinnedRegion, PinnedPoints, list, tuple),
 }
-_LISTS: dict[str, type] = {"forces": Force, "edits": Edit, "copies": Copy}
+_LISTS = {"forces": (Force,), "edits": (Edit,), "copies": (Copy,), "hold": (Region, PinnedRegion, PinnedPoints)}

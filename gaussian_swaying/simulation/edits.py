@@ -6,7 +6,6 @@ import copy
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -189,7 +188,7 @@ class SceneEditor:
         """
         before = self.snapshot()
         try:
-            return self._pass_on(state, self._apply_all(edits, flowed=True))
+            return self._go_on(state, edits)
         except Exception:
             self.restore(before)
             self._pass_on()
@@ -201,8 +200,19 @@ class SceneEditor:
         if not self.edits:  # the host need not wait for the time
             return state
         edits = self.due(float(state.time) + 1e-3 * self.stepper.frame_dt)
-        edited = self._pass_on(state, self._apply_all(edits, flowed=True))
+        edited = self._go_on(state, edits)
         return state if resumed else edited
+
+    def _go_on(self, state: State, edits: Sequence[Edit]) -> State:
+        """Apply edits; the internal variable of particles that get another law starts anew."""
+        changed = self._apply_all(edits, flowed=True)
+        rest = self._pass_on(running=True)
+        if rest is None:
+            return state
+        start = rest.internal
+        if start is not None and state.internal is not None:
+            start = state.internal if changed is None else torch.where(changed, start, state.internal)
+        return state.replace(internal=start)
 
     def _apply_all(self, edits: Sequence[Edit], flowed: bool = False) -> Tensor | None:
         """Change the scene; returns which particles (P,) got another law, None if the material is the same."""
@@ -210,9 +220,9 @@ class SceneEditor:
         changed = [part for part, edit in zip(changed, edits, strict=True) if edit.of_material]
         return torch.stack(changed).any(0) if changed else None
 
-    def _pass_on(self, state: State | None = None, changed: Tensor | None = None) -> Any:
-        """Give the material of the scene to the stepper; ``changed`` as from :meth:`_apply_all`."""
-        return self.stepper.take(dataclasses.replace(self.stepper.setup, points=self.scene.points), state, changed)
+    def _pass_on(self, running: bool = False) -> State | None:
+        """Give the material of the scene to the stepper."""
+        return self.stepper.take(dataclasses.replace(self.stepper.setup, points=self.scene.points), running)
 
     # ---- the scene
 

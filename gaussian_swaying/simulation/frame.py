@@ -44,6 +44,9 @@ class Frame:
     health: FrameDiagnostics
     _version: int = field(repr=False, default=0)
 
+    def __repr__(self) -> str:
+        return f"Frame({self.index}, time={self.time:g})"
+
     @property
     def time(self) -> float:
         """Simulated time [s]."""

@@ -246,6 +246,8 @@ def in_settings(settings: Namespace, name: str, value: Any) -> None:
         _arguments([entries[int(parts[2])]], "", name)[parts[3]] = value
     else:
         settings[name] = value
+        if name == "wind.flow":
+            settings.wind.schedule = None
 
 
 def all_in_settings(settings: Namespace, values: Mapping[str, Any]) -> None:

@@ -199,6 +199,9 @@ class SimulatedScene(nn.Module):
         self.rest_facing: Tensor
         self.identity: Tensor
 
+    def __repr__(self) -> str:
+        return f"{len(self.model.means):,} Gaussians of which {len(self.moving):,} move by {self.points.count:,} points"
+
     @staticmethod
     def _joints(scene: Scene, labels: Tensor | None, body: Body, dx: float) -> tuple[PointJoint, ...]:
         if scene.parts is None or labels is None or not any(part.has_joint for part in scene.parts.parts):

@@ -115,7 +115,7 @@ class Simulation(Fixed):
         device: auto uses a CUDA GPU if there is one, else the CPU.
         up: Python only, if ``scene`` is not a :class:`Scene`: direction in the scene that points up.
         hold: Python only, if no solver is given: what is held in place. A region, or a pin with a kind of its own:
-            ``PinnedRegion(region, kind="clamp")`` also holds the slope, ``PinnedPoints`` holds given places.
+            ``PinnedRegion(region, kind="clamp")`` also holds the slope, ``PinnedPoints`` holds given places; or a list.
         renderer: Python only: draws the Gaussians; by default gsplat on CUDA and the torch renderer elsewhere.
         cloud: Python only: the Gaussians of ``scene.ply`` if they have been read already, or a part of them.
 
@@ -208,6 +208,9 @@ class Simulation(Fixed):
         self._files: list[Path] = []
         self._resumable: tuple[Path, int] | None = None
         self._text, self._given, self._first = "", given, self._running()
+
+    def __repr__(self) -> str:
+        return f"Simulation({self.scene}, {self.material}, {self.solver}, {self.wind}, {self.device})"
 
     # ---- parts
 
@@ -337,38 +340,33 @@ class Simulation(Fixed):
         return copy.copy(recorder or Recorder())
 
     @in_turn
-    def change(self, state: State, values: Mapping[str, Any]) -> State:
-        """Change numbers between two frames; they stay changed when the simulation starts again.
+    def change(self, name: str | Mapping[str, Any], value: Any = None) -> None:
+        """Change a number between two frames: ``simulation.change("wind.speed", 3)``; it stays after another start.
 
         Args:
-            state: The state now.
-            values: Values by the names of :mod:`gaussian_swaying.simulation.parameters`, such as ``wind.speed`` or
-                ``material.E``.
-
-        Returns:
-            The state from which the run continues.
+            name: A name of :mod:`gaussian_swaying.simulation.parameters`, such as ``material.E``; or several with their
+                values.
+            value: Its value.
 
         Raises:
             ValueError: If there is no such parameter, a value is out of range, or the simulation has no place for it;
                 everything then stays as it was.
         """
-        changed = self.adopt(with_values(self.setup, values), state)
-        assert changed is not None
-        return changed
+        self.adopt(with_values(self.setup, {name: value} if isinstance(name, str) else name))
 
     @in_turn
-    def adopt(self, setup: Setup, state: State | None = None) -> State | None:
-        """As :meth:`change`, with a setup; without a state, before the simulation starts."""
+    def adopt(self, setup: Setup) -> None:
+        """As :meth:`change`, with a setup."""
         before, editor = self.setup, self._editor
         if setup.points is not before.points and editor.edits:
             raise ValueError("`edits` give the material of parts of the object: change it there, not everywhere.")
         try:
-            return self._adopt(setup, state)
+            self._adopt(setup)
         except Exception:
-            self._adopt(before, state)
+            self._adopt(before)
             raise
 
-    def _adopt(self, setup: Setup, state: State | None) -> State | None:
+    def _adopt(self, setup: Setup) -> None:
         before = self.setup
         with torch.inference_mode(False):
             for part in (setup.wind, setup.aero, *setup.forces):
@@ -376,7 +374,7 @@ class Simulation(Fixed):
             if setup.points is not before.points:
                 self.scene.points = setup.points
                 self._editor.rebase(setup.points)
-            return self._stepper.take(setup, state)
+            self._stepper.take(setup, running=self._stepper.starts > 0)
 
     def variant(self, values: Mapping[str, Any], recorder: Recorder | None = None, config: str = "") -> Simulation:
         """Another simulation of the same scene with other numbers; it shares Gaussians, cameras and pins.

@@ -359,37 +359,31 @@ class Stepper:
     # ---- other values
 
     @in_turn
-    def take(self, setup: Setup, state: State | None = None, changed: Tensor | None = None) -> State | None:
+    def take(self, setup: Setup, running: bool = False) -> State | None:
         """Go on with another material, wind or forces; the solver is bound again only if its part has changed.
 
         Args:
             setup: The new setup, of the one scene.
-            state: The state now; None before the start.
-            changed: Particles that got another law, bool, shape (P,); their internal variable starts anew.
+            running: Whether there is a state from which to go on; else the next start binds the solver.
 
         Returns:
-            The state from which the run continues.
+            The state at rest if the solver was bound again.
         """
         before, self.setup, self.setups = self.setup, setup, self._spread(setup)
         if setup.solver is not before.solver:
             assign(self.solver, settings=setup.solver)
         kept = len(self._bound) == len(self.setups) and all(map(operator.is_, self._bound, self.materials))
-        if state is None or (kept and setup.solver is before.solver):
-            return state
-        start = self.bind().internal
-        if start is not None and state.internal is not None and changed is not None:
-            start = torch.where(changed, start, state.internal)
-        elif start is not None and state.internal is not None:
-            start = state.internal
-        state = state.replace(internal=start)
+        if not running or (kept and setup.solver is before.solver):
+            return None
+        rest = self.bind()
         self.solver.prepare()
-        steps = min(MAX_GROWTH * self.solver.substeps(state, self.frame_dt), MAX_SUBSTEPS)
+        steps = min(MAX_GROWTH * self.solver.substeps(rest, self.frame_dt), MAX_SUBSTEPS)
         self.most_substeps = max(self.most_substeps, steps)
         if self._tearing is not None:
             elastic = self.solver.points.elastic
             if elastic is not None:  # particles that flowed apart before are not torn
                 self._tearing.elastic = elastic if self._tearing.elastic is None else elastic & self._tearing.elastic
-        return state
+        return rest
 
     # ---- a frame
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import torch
 import yaml
 
-from gaussian_swaying.mpm.state import State
 from gaussian_swaying.simulation.parameters import POLAR, all_in_settings, find, of_settings, parameter
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -33,8 +32,6 @@ def changed_settings(parser: ArgumentParser, settings: Namespace, values: Mappin
     numbers = {name: value for name, value in values.items() if find(name) is not None}
     shader = {name: value for name, value in values.items() if name.startswith(SHADER)}
     further = {name: value for name, value in values.items() if name not in numbers and name not in shader}
-    if further.get("wind.schedule", "") is None and settings.wind.schedule is None:
-        del further["wind.schedule"]  # nothing changes
     if further:
         data = yaml.safe_load(parser.dump(settings, skip_validation=True))
         for name, value in further.items():
@@ -54,9 +51,7 @@ def changed_settings(parser: ArgumentParser, settings: Namespace, values: Mappin
     return settings
 
 
-def take(
-    simulation: Simulation, state: State, parser: ArgumentParser, settings: Namespace, names: Sequence[str]
-) -> State | None:
+def take(simulation: Simulation, parser: ArgumentParser, settings: Namespace, names: Sequence[str]) -> bool:
     """Change a simulation between two steps.
 
     Parameters, the wind, aerodynamic coefficients, shading, background and length of a frame change in motion; the
@@ -64,24 +59,23 @@ def take(
 
     Args:
         simulation: The simulation.
-        state: Its state now.
         parser: From :meth:`Simulation.parser`.
         settings: The settings with all changes.
         names: The fields and parameters that have changed, with dots.
 
     Returns:
-        The state to go on from; None if another field has changed, so that the simulation has to be made anew.
+        False if another field has changed, so that the simulation has to be made anew.
     """
     numbers = ["wind.flow" if name in POLAR else name for name in names if find(name) is not None]
     heads = {name.split(".")[0] for name in names if find(name) is None}
     if not heads <= {"wind", "aero", *PICTURE}:
-        return None
+        return False
     if "frame_dt" in heads and simulation.setup.air is not None:
-        return None  # computed air has one length of the frame
+        return False  # computed air has one length of the frame
     if any(name.startswith("material.") for name in numbers) and (simulation.material.regions or settings.edits):
-        return None  # each part has its own
+        return False  # each part has its own
     if not all(parameter(name).same_points for name in numbers):
-        return None
+        return False
     if settings.wind.schedule is not None or heads & {"wind", "aero"}:  # as a whole
         heads |= {name.split(".")[0] for name in numbers} & {"wind", "aero"}
         numbers = [name for name in numbers if name.split(".")[0] not in heads]
@@ -89,7 +83,7 @@ def take(
     parts = parser.instantiate(settings) if heads else {}
     painter = simulation.painter
     if values:
-        state = simulation.change(state, values)
+        simulation.change(values)
     if "wind" in heads:
         simulation.wind = parts["wind"]
     if "aero" in heads:
@@ -100,4 +94,4 @@ def take(
         painter.background = torch.tensor(parts["background"], dtype=torch.float32, device=simulation.device)
     if "frame_dt" in heads:
         simulation.frame_dt = float(settings.frame_dt)
-    return state
+    return True

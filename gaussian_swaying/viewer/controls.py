@@ -279,7 +279,7 @@ class Controls(Panel):
     def _blow(self) -> None:
         angles = self.wind_speed.value, self.azimuth.value, self.elevation.value
         flow = flow_of((0.0, 0.0, 0.0), dict(zip(POLAR, angles, strict=True)))
-        self.session.change({"wind.flow": [round(x, 4) for x in flow], "wind.schedule": None})
+        self._set("wind.flow", [round(x, 4) for x in flow])
         self._draw_arrow(flow)
 
     def _show(self) -> None:

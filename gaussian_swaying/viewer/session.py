@@ -371,12 +371,11 @@ class Session:
     def _apply(self, settings: Namespace, names: list[str]) -> None:
         if not self._broken:
             self.problem = None
-        state = take(self.simulation, self.snapshot.state, self.parser, settings, names)
-        if state is None:
-            self._take_settings(settings)
-        else:
+        if take(self.simulation, self.parser, settings, names):
             self.settings = settings
-            self._publish(state, self.snapshot.health)
+            self._publish(self.snapshot.state, self.snapshot.health)
+        else:
+            self._take_settings(settings)
 
     def _undo(self) -> None:
         if not self._past:

@@ -376,6 +376,11 @@ class WindField(Fixed, nn.Module):
         return type(self) is WindField and self.uniform and isinstance(self.seed, int) and parts
 
     @property
+    def flow(self) -> Tensor | None:
+        """The flow [m/s] if it is steady, shape (3,); else None."""
+        return self.flows[0] if len(self.flows) == 1 else None
+
+    @property
     def scenes(self) -> int | None:
         """Number of scenes with winds of their own; None for one wind."""
         return self.flows.shape[1] if self.flows.ndim > 2 else None

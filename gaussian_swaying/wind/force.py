@@ -524,10 +524,6 @@ class AeroForce(Fixed, nn.Module):
         )  # fmt: skip
         return torch.stack(torch.broadcast_tensors(*force), dim=-1), area
 
-    def extra_repr(self) -> str:
-        """The settings, for printing."""
-        return f"C_D={float(self.C_D):g}, C_F={float(self.C_F):g}, C_L={float(self.C_L):g}, law={self.law}"
-
 
 @triton.jit
 def air_push(F, velocity, position, point, numbers, now, table, OPTIONS: tl.constexpr):

@@ -130,7 +130,7 @@ INSIDE = {"class_path": "LookAtCamera", "init_args": {"eye": [0.6, 0.0, 0.4], "t
         ({"config": "/nowhere/at_all.yaml"}, ["/nowhere/at_all.yaml", "does not exist"]),
         ({"scene.ply": "none.ply"}, ["none.ply"]),
         ({"wind.flwo": [1, 0, 0]}, ["--wind.flwo", "wind.flow"]),
-        ({"scene.region": EMPTY}, ["No Gaussian is selected", "Box(min=[5.0", "move the region"]),
+        ({"scene.region": EMPTY}, ["No Gaussian is selected", "Box(min=[5,", "move the region"]),
         ({"scene.opacity_threshold": 0.999}, ["opacity threshold", "lower the threshold"]),
         ({"scene.longest_side": 1.0}, ["longest_side", "metres_per_unit", "not both"]),
         (

@@ -100,6 +100,48 @@ def test_another_wind_holds_from_the_next_frame_on():
     assert ends == [0, 1]
 
 
+def test_numbers_change_by_their_names_between_frames():
+    """As a run with these numbers from the state at which they changed."""
+    simulation, other = _flag(), _flag(material=Material(E=3e4, density=30.0), wind=[0.0, 5.0, 0.0])
+    for frame in simulation.frames(4):
+        if frame.index == 1:
+            middle = frame.state
+            simulation.change("material.E", 3e4)
+            simulation.change({"wind.azimuth": 90.0, "wind.speed": 5.0})
+    other.start()
+    for _ in range(2):
+        middle, _ = other.advance(middle)
+    torch.testing.assert_close(middle.position, frame.state.position, rtol=0, atol=1e-6)
+
+
+def test_several_pins():
+    """Regions and pins; what no pin holds falls, and a run says so before it starts."""
+    ends = (POLE, PinnedRegion(Box([1.09, None, None], [None, None, None])))
+    simulation = _flag(hold=list(ends))
+    *_, last = simulation.frames(3)
+    moved = (last.state.position - simulation.scene.points.position).norm(dim=-1)
+    x = simulation.scene.points.position[:, 0]
+    assert float(moved[(x == x.min()) | (x == x.max())].max()) < 0.05 * float(moved.max())
+    with pytest.raises(TypeError, match="`hold` to be a list of Region or PinnedRegion or PinnedPoints"):
+        _flag(hold=[POLE, "foot"])
+    with pytest.warns(UserWarning, match="Nothing holds the object.*so it falls"):
+        next(_flag(hold=None).frames(1))
+
+
+def test_what_is_printed_tells_what_it_is():
+    simulation = _flag(hold=[PinnedRegion(POLE, kind="clamp")])
+    held = "PinnedRegion(region=Box(min=[-inf, -inf, -inf], max=[0.11, inf, inf]), kind='clamp', end=inf)"
+    assert repr(simulation) == (
+        "Simulation(96 Gaussians of which 96 move by 96 points, Material(E=3000, density=30), "
+        f"MPMSolver(dx=0.2, gravity=[0, 0, 0], boundaries=[{held}]), WindField(flow=[6, 1.5, 0]), cpu)"
+    )
+    frame = next(simulation.frames(1))
+    assert repr(frame) == "Frame(0, time=0)"
+    for part in (frame.state, frame.gaussians, simulation.setup, simulation.painter, simulation.solver.points):
+        assert "96, 3" in repr(part) or "96 Gaussians" in repr(part)
+        assert len(repr(part)) < 1000
+
+
 class Shear(SpatialWind):
     def forward(self, time, position):
         return position[..., :1] * position.new_tensor([0.0, 5.0, 0.0])

@@ -79,10 +79,11 @@ def test_edits_and_parameters_reach_it(simulation):
     state = simulation.start()
     soft = simulation.edit(state, Edit(region=Sphere([1.0, 0.0, 0.5], 0.3), E=1e3))
     assert float(simulation.solver.stiffness.amin()) < 1e-1 * float(simulation.solver.stiffness.amax())
-    changed = simulation.change(simulation.start(), {"wind.speed": 5.0, "solver.damping": 4.0})
+    state = simulation.start()
+    simulation.change({"wind.speed": 5.0, "solver.damping": 4.0})
     assert simulation.solver.settings.damping == 4.0
     assert float(simulation.wind.flows[0].norm()) == pytest.approx(5.0)
-    _, health = simulation.advance(changed)
+    _, health = simulation.advance(state)
     assert health.kinetic > 0
     assert soft.position.shape == state.position.shape
 

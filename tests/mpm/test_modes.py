@@ -284,7 +284,7 @@ def test_a_change_keeps_the_motion_continuous(make_simulation):
         state, _ = simulation.advance(state)
     for values in ({"material.E": 9e3}, {"solver.damping": 3.0}, {"wind.speed": 1.0}):
         before = state
-        state = simulation.change(state, values)
+        simulation.change(values)
         q, p = simulation.solver.bound.amplitudes(state)
         shown = simulation.solver.bound.shown(state, q, p)
         assert_close(shown.position, before.position, rtol=1e-5, atol=1e-6)
@@ -415,7 +415,7 @@ def test_auto_takes_modes_where_they_will_do_and_says_why(make_simulation):
         assert told["why"] == simulation.solver.why
         assert ("more than modes" in told["why"]) == (formulation == "total")
         state, _ = simulation.advance(simulation.start())
-        state = simulation.change(state, {"material.E": 300.0})  # while it runs, it stays what it is
+        simulation.change("material.E", 300.0)  # while it runs, it stays what it is
         assert simulation.solver.formulation == formulation
         state, _ = simulation.advance(state)
         assert bool(state.position.isfinite().all())

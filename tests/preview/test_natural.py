@@ -62,7 +62,7 @@ def test_it_has_the_frequency_and_mass_that_it_announces(bush):
     own = int((bound.square.sqrt() - bound.first).abs().argmin())
     q = q.clone()
     q[own] = 0.02
-    simulation.change(state, {"wind.speed": 0.0})
+    simulation.change("wind.speed", 0.0)
     line, times = moved(simulation, bound.shown(state, q, p), 200)
     top = line[:, line.norm(dim=-1).amax(0).argmax()].double()
     guess = (told["frequency_Hz"], 0.2, float(top[0].norm()), 0.0, 0.0)

@@ -92,8 +92,8 @@ def test_what_is_written_is_read_and_is_that_of_the_configuration(name, config, 
     changed = with_values(before, {name: value})
     _close(value_of(changed, name), value)
     _close(value_of(before, name), old)  # as it was
-    state = simulation.advance(simulation.start())[0]
-    state = simulation.change(state, {name: value})
+    simulation.advance(simulation.start())
+    simulation.change(name, value)
     _close(value_of(simulation.setup, name), value)
     settings = parser.parse_args(["--config", str(config), "--device=cpu"])
     _close(of_settings(settings, name), old)
@@ -125,10 +125,10 @@ def test_what_is_written_is_read_and_is_that_of_the_configuration(name, config, 
 )
 def test_what_is_out_of_range_or_not_there_is_refused_and_nothing_changes(name, value, words, config):
     simulation = Simulation.from_yaml(config, device="cpu")
-    state = simulation.start()
+    simulation.start()
     before = simulation.setup
     with pytest.raises((ValueError, TypeError), match=words):
-        simulation.change(state, {"material.density": 30.0, name: value})
+        simulation.change({"material.density": 30.0, name: value})
     after = simulation.setup
     assert all(getattr(after, part) is getattr(before, part) for part in ("points", "wind", "aero", "solver"))
 
