@@ -14,7 +14,7 @@ from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.preview.parts import greenish
 from gaussian_swaying.scenes.ficus import FicusScene
 from gaussian_swaying.scenes.procedural import GivenScene
-from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.body import Scene
 
 
 def main(folder: Path, frames: int = 50, spacing: float = 0.03, dx: float = 0.08) -> dict[str, float]:

@@ -20,9 +20,7 @@ from gaussian_swaying.preview.results import write
 from gaussian_swaying.preview.starter import starter_yaml
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
-from gaussian_swaying.simulation.material import Material
-from gaussian_swaying.simulation.scene import Scene
-from gaussian_swaying.simulation.simulated_scene import SimulatedScene
+from gaussian_swaying.simulation.body import Material, Scene, SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.wind.field import WindField
 

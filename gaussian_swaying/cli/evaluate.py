@@ -13,7 +13,7 @@ from pathlib import Path
 
 from gaussian_swaying import _program as program
 from gaussian_swaying.cli.errors import run_command
-from gaussian_swaying.simulation.defaults import resolve_device
+from gaussian_swaying.simulation.model import resolve_device
 
 
 def build_parser() -> argparse.ArgumentParser:

@@ -18,7 +18,7 @@ from gaussian_swaying.gaussians.export import SUFFIXES, export_cloud, export_fra
 from gaussian_swaying.gaussians.formats import READABLE, read_gaussians
 from gaussian_swaying.gaussians.spz import VERSIONS
 from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.simulation.recorded import RecordedRun
+from gaussian_swaying.simulation.simulation import RecordedRun
 from gaussian_swaying.viewer.film.page import write_film
 
 

@@ -61,9 +61,8 @@ from gaussian_swaying.preview.suggest import (
     of_material,
     suggest,
 )
-from gaussian_swaying.simulation.progress import duration
-from gaussian_swaying.simulation.roles import classify
-from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.simulation.measure import duration
+from gaussian_swaying.simulation.simulation import Simulation, classify
 from gaussian_swaying.wind.turbulence import LOOKS
 
 LARGE = 256_000_000  # bytes of a file of which only the constant colours are read

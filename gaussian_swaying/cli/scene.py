@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from gaussian_swaying.cli.errors import guessing
 from gaussian_swaying.cli.shipped import names, with_shipped
-from gaussian_swaying.simulation.defaults import resolve_device
+from gaussian_swaying.simulation.model import resolve_device
 from gaussian_swaying.viewer.scenes import settings_of_splat
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from gaussian_swaying.cli.errors import guessing, how_to_resume, run_command
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.geometry.origin import counted_from
 from gaussian_swaying.runs.signals import stop_signals
-from gaussian_swaying.simulation.diagnostics import SimulationDiverged
+from gaussian_swaying.simulation.measure import SimulationDiverged
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.wind.computed_air import resolution
 from gaussian_swaying.wind.field import WindField

@@ -12,8 +12,7 @@ from torch import Tensor
 from gaussian_swaying.fitting.tracks import Tracks
 from gaussian_swaying.fitting.videos import Footage
 from gaussian_swaying.rendering.cameras.camera import Camera
-from gaussian_swaying.simulation.roles import classify
-from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.simulation.simulation import Simulation, classify
 
 BAND = 22
 """Height of the line of text above a picture [pixels]."""

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.fitting.unknowns import CHANGES, FILM_START, Unknown, is_change
-from gaussian_swaying.simulation.parameters import flow_of
+from gaussian_swaying.simulation.model import flow_of
 from gaussian_swaying.wind.field import WindField
 
 KNOTS, EVERY = 3, 0.4

@@ -18,8 +18,8 @@ from gaussian_swaying.fitting.videos import Footage
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.rendering.cameras.camera import Camera, project
-from gaussian_swaying.simulation.diagnostics import SimulationDiverged
-from gaussian_swaying.simulation.painter import Painter
+from gaussian_swaying.simulation.draw import Painter
+from gaussian_swaying.simulation.measure import SimulationDiverged
 from gaussian_swaying.simulation.simulation import Simulation
 
 LEAST_FACING = 0.05

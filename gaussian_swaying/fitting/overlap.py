@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.rendering.cameras.camera import Camera, project, resized_intrinsics
-from gaussian_swaying.simulation.painter import Painter
+from gaussian_swaying.simulation.draw import Painter
 
 WINDOW, WIDE = 15, 960
 """Side of the square that is followed, where the longer side of the picture has at most ``WIDE`` [pixels]."""

@@ -25,7 +25,7 @@ from gaussian_swaying.fitting.variants import setup_of
 from gaussian_swaying.fitting.videos import Footage
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.recording.video import VideoEncoder
-from gaussian_swaying.simulation.parameters import POLAR, flow_of, in_settings, value_of
+from gaussian_swaying.simulation.model import POLAR, flow_of, in_settings, value_of
 from gaussian_swaying.simulation.simulation import Simulation
 
 if TYPE_CHECKING:

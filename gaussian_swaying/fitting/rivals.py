@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 import torch
 
 from gaussian_swaying.fitting.unknowns import Unknown, values_at
-from gaussian_swaying.simulation.parameters import Setup, flow_of
+from gaussian_swaying.simulation.model import Setup, flow_of
 
 SHAKEN = 0.12
 """Change of what is sought of the material, as a share of the range."""

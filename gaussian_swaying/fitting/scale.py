@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from gaussian_swaying._fixed import changed
-from gaussian_swaying.simulation.parameters import Setup, value_of, with_values
+from gaussian_swaying.simulation.model import Setup, value_of, with_values
 from gaussian_swaying.wind.field import WindField
 
 SCALE = "scene.metres_per_unit"

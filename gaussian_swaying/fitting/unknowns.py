@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 from gaussian_swaying._checks import check_choice
 from gaussian_swaying.fitting.scale import SCALE, at_scale
-from gaussian_swaying.simulation import parameters
-from gaussian_swaying.simulation.parameters import find, parameter, with_values
+from gaussian_swaying.simulation.model import find, names, parameter, with_values
 from gaussian_swaying.simulation.simulation import Simulation
 
 SCALES = ("log", "linear")
@@ -55,7 +54,7 @@ class Unknown:
         known = find(self.name)
         own = self.name in (FILM_START, SCALE) or is_change(self.name)
         if not own and (known is None or known.kind != "number"):
-            numbers = (name for name in parameters.names() if parameter(name.replace("*", "0")).kind == "number")
+            numbers = (name for name in names() if parameter(name.replace("*", "0")).kind == "number")
             sought = [FILM_START, SCALE, *numbers]
             raise ValueError(f"`{self.name}` cannot be sought: use {', '.join(sought)}, or put it into `known`.")
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):

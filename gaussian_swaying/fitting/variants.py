@@ -13,10 +13,10 @@ from gaussian_swaying.fitting.changing import changing
 from gaussian_swaying.fitting.scale import SCALE, at_scale
 from gaussian_swaying.fitting.unknowns import FILM_START, is_change, of_simulation
 from gaussian_swaying.mpm.state import State
-from gaussian_swaying.simulation.diagnostics import SimulationDiverged
-from gaussian_swaying.simulation.parameters import Setup, parameter, with_values
+from gaussian_swaying.simulation.measure import SimulationDiverged
+from gaussian_swaying.simulation.model import Setup, parameter, with_values
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.simulation.stepper import Stepper, why_not_batched
+from gaussian_swaying.simulation.step import Stepper, why_not_batched
 from gaussian_swaying.wind.field import WindField
 from gaussian_swaying.wind.force import with_added_mass
 

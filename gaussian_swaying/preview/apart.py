@@ -7,7 +7,7 @@ from torch import Tensor
 
 from gaussian_swaying.gaussians.connectivity import pieces
 from gaussian_swaying.geometry.groups import equal_rows, joined
-from gaussian_swaying.simulation.simulated_scene import SimulatedScene
+from gaussian_swaying.simulation.body import SimulatedScene
 
 REACH = 3  # cells that a node reaches
 ENOUGH = 0.1  # share of the Gaussians that lie beside something else, from which on nodes of their own help

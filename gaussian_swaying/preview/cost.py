@@ -20,7 +20,7 @@ from gaussian_swaying.kernels.cpu import compiled
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.mpm.timestep import wave_speed
 from gaussian_swaying.recording.writer import WORKERS
-from gaussian_swaying.simulation.diagnostics import SimulationDiverged
+from gaussian_swaying.simulation.measure import SimulationDiverged
 from gaussian_swaying.simulation.simulation import Simulation
 
 BUDGET = 2.5  # s; for the frames that are timed

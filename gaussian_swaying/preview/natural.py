@@ -28,7 +28,7 @@ from gaussian_swaying.mpm.total import Total
 from gaussian_swaying.preview.kinds import KINDS, Kind
 from gaussian_swaying.preview.shape import extent, quantile
 from gaussian_swaying.preview.stretch import cloth_motion, linear_motion, rate_for, typical_start
-from gaussian_swaying.simulation.simulated_scene import SimulatedScene
+from gaussian_swaying.simulation.body import SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.wind.field import WindField
 from gaussian_swaying.wind.force import AeroForce, WindForce, added_mass_per_area

@@ -27,8 +27,7 @@ from gaussian_swaying.rendering.cameras.camera import Camera, orbit_camera, proj
 from gaussian_swaying.rendering.gsplat_renderer import make_renderer
 from gaussian_swaying.rendering.thinning import DETAIL
 from gaussian_swaying.rendering.tints import HELD, greyed, tinted
-from gaussian_swaying.simulation.roles import Roles, classify, conditions
-from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.simulation.simulation import Roles, Simulation, classify, conditions
 
 if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw

@@ -22,9 +22,8 @@ from gaussian_swaying.preview.place import Place
 from gaussian_swaying.preview.starter import region_dict
 from gaussian_swaying.preview.suggest import MOST_CELLS, Suggestion, finest_spacing
 from gaussian_swaying.preview.up import wind_words
-from gaussian_swaying.simulation.progress import duration
-from gaussian_swaying.simulation.roles import classify, conditions
-from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.simulation.measure import duration
+from gaussian_swaying.simulation.simulation import Simulation, classify, conditions
 from gaussian_swaying.wind.computed_air import resolution
 from gaussian_swaying.wind.field import WindField
 

@@ -47,7 +47,7 @@ from gaussian_swaying.preview.supports import (
     swinging_parts,
 )
 from gaussian_swaying.preview.up import UpGuess, given_up, guess_up
-from gaussian_swaying.simulation.extent import suggest_spacing
+from gaussian_swaying.simulation.body import suggest_spacing
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.wind.field import WindField
 from gaussian_swaying.wind.turbulence import LOOKS

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import copy
+import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_frames, check_positive, check_vector
+from gaussian_swaying._files import sha256
 from gaussian_swaying._fixed import Fixed, changed
 from gaussian_swaying._turns import Turn, in_turn
 from gaussian_swaying.config.parser import (
@@ -27,26 +34,37 @@ from gaussian_swaying.config.parser import (
     with_custom,
 )
 from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.kernels.graphs import tensors_in
+from gaussian_swaying.kernels.launch import compiles
+from gaussian_swaying.mpm.boundary import Boundary
 from gaussian_swaying.mpm.colliders import Obstacle
 from gaussian_swaying.mpm.contact import Contact
 from gaussian_swaying.mpm.forces import Force, as_forces
 from gaussian_swaying.mpm.materials import known_material
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.mpm.state import State
+from gaussian_swaying.recording.nodes import load_nodes
 from gaussian_swaying.recording.recorder import Recorder
+from gaussian_swaying.recording.resume import packed_frames
+from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.rendering.cameras.camera_path import CameraPath
+from gaussian_swaying.rendering.gsplat_renderer import load_kernels, loaded_before
 from gaussian_swaying.rendering.protocol import Renderer
 from gaussian_swaying.rendering.shading import Shader
-from gaussian_swaying.simulation.ahead import load_ahead
-from gaussian_swaying.simulation.copies import Copy, copies_of
-from gaussian_swaying.simulation.copies_painter import CopiesPainter
-from gaussian_swaying.simulation.defaults import (
+from gaussian_swaying.simulation.body import Material, SimulatedScene, with_parts
+from gaussian_swaying.simulation.draw import CopiesPainter, Frame, Painter, frames_from
+from gaussian_swaying.simulation.measure import FrameDiagnostics, SimulationDiverged
+from gaussian_swaying.simulation.model import (
+    Copy,
     DeviceLike,
+    Edit,
     HoldLike,
     MaterialLike,
+    Normalisation,
     SceneLike,
+    Setup,
     SolverLike,
     WindLike,
     as_camera,
@@ -56,21 +74,45 @@ from gaussian_swaying.simulation.defaults import (
     as_wind,
     check_types,
     resolve_device,
+    with_values,
 )
-from gaussian_swaying.simulation.diagnostics import FrameDiagnostics
-from gaussian_swaying.simulation.edits import Edit, SceneEditor
-from gaussian_swaying.simulation.frame import Frame, frames_from
-from gaussian_swaying.simulation.labelled import with_parts
-from gaussian_swaying.simulation.material import Material
-from gaussian_swaying.simulation.normalisation import Normalisation
-from gaussian_swaying.simulation.painter import Painter
-from gaussian_swaying.simulation.parameters import Setup, with_values
-from gaussian_swaying.simulation.run import Run
-from gaussian_swaying.simulation.simulated_scene import SimulatedScene
-from gaussian_swaying.simulation.stepper import Stepper
+from gaussian_swaying.simulation.record import Run
+from gaussian_swaying.simulation.step import SceneEditor, Stepper, copies_of
 from gaussian_swaying.wind.computed_air import ComputedAir
 from gaussian_swaying.wind.field import SpatialWind, WindField
 from gaussian_swaying.wind.force import AeroForce
+
+
+def load_ahead(device: torch.device) -> Callable[[], None]:
+    """Begin to load what a device needs, in a thread: its context, Triton's compiler and gsplat's kernels.
+
+    What cannot be loaded is left to those who need it, who meet the error. Nothing is compiled that takes long.
+
+    Args:
+        device: The device of a simulation; only a CUDA device needs anything.
+
+    Returns:
+        A function that waits for the end; call it before the device is used, as no other thread may use it while a
+        graph is recorded.
+    """
+    if device.type != "cuda":
+        return lambda: None
+    current = torch.cuda.current_device() if torch.cuda.is_initialized() else 0  # a new thread begins with the first
+    number = current if device.index is None else device.index
+    thread = threading.Thread(target=_load, args=(number,), name="load-ahead")
+    thread.start()
+    return thread.join
+
+
+def _load(number: int) -> None:
+    for step in (
+        lambda: torch.empty(1, device="cuda"),
+        lambda: compiles("cuda"),
+        lambda: loaded_before() and load_kernels(),
+    ):
+        with suppress(Exception), torch.cuda.device(number):
+            step()
+
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
@@ -271,7 +313,7 @@ class Simulation(Fixed):
 
     @property
     def setup(self) -> Setup:
-        """The present scene, material and drivers; see :mod:`gaussian_swaying.simulation.parameters`."""
+        """The present scene, material and drivers; see :mod:`gaussian_swaying.simulation.model`."""
         return self._stepper.setup
 
     @property
@@ -344,7 +386,7 @@ class Simulation(Fixed):
         """Change a number between two frames: ``simulation.change("wind.speed", 3)``; it stays after another start.
 
         Args:
-            name: A name of :mod:`gaussian_swaying.simulation.parameters`, such as ``material.E``; or several with their
+            name: A name of :mod:`gaussian_swaying.simulation.model`, such as ``material.E``; or several with their
                 values.
             value: Its value.
 
@@ -488,7 +530,7 @@ class Simulation(Fixed):
 
     @in_turn
     def advance(self, state: State) -> tuple[State, FrameDiagnostics]:
-        """Advance by one frame; see :meth:`Stepper.advance <gaussian_swaying.simulation.stepper.Stepper.advance>`."""
+        """Advance by one frame; see :meth:`Stepper.advance <gaussian_swaying.simulation.step.Stepper.advance>`."""
         return self._stepper.advance(state)
 
     @in_turn
@@ -572,3 +614,246 @@ class Simulation(Fixed):
 
 def _same(before: object, now: object) -> bool:
     return before is now or (isinstance(now, int | float) and before == now)
+
+
+def batch_of(members: Sequence[Simulation]) -> Stepper:
+    """A stepper that advances simulations of one scene together.
+
+    Args:
+        members: A simulation, and variants of it (``Simulation.variant``) that differ in wind and material.
+    """
+    first = members[0]
+    if any(member.stepper.copies is not None for member in members):
+        raise ValueError("These cannot be simulated as a batch: they have `copies`, which are one already.")
+    if any(member.editor.edits for member in members):
+        raise ValueError("These cannot be simulated as a batch: they have `edits`; put their material into `material`.")
+    solver = first.solver.like(first.setup.solver)
+    return Stepper(solver, [member.setup for member in members], first.frame_dt, turn=first.turn)
+
+
+@torch.inference_mode()
+def run_batch(
+    members: Sequence[Simulation], folders: Sequence[Path | None], frames: int, settings: Sequence[Mapping[str, Any]]
+) -> list[dict[str, Any] | None]:
+    """Simulate, draw and record simulations of one scene together, as ``Simulation.run`` does for one.
+
+    There are no checkpoints: what is interrupted starts again.
+
+    Args:
+        members: As for :func:`batch_of`.
+        folders: Folder of each; None for one that is only simulated.
+        frames: Number of frames.
+        settings: Further entries of each summary.
+
+    Returns:
+        The summaries.
+    """
+    batch = batch_of(members)
+    state = batch.start()
+    opened, runs = [], dict[int, Run]()
+    try:
+        for index, (member, folder) in enumerate(zip(members, folders, strict=True)):
+            if folder is not None:
+                cameras = tuple(member.painter.cameras)
+                member.recorder.open(folder, member.config, False, 1 / batch.frame_dt, cameras, alone=False)
+                opened.append(member.recorder)
+                runs[index] = Run(member.painter, member.editor, member.recorder, frames, member.config)
+        begin = time.perf_counter()
+        if batch.device.type == "cuda" and frames > 1:  # compiles the kernels; the real frame reports an error
+            with suppress(SimulationDiverged):
+                batch.advance(state)
+        startup = (time.perf_counter() - begin) / len(members)
+        begin = time.perf_counter()
+        each = batch.at_first(state).each()
+        for frame in range(frames):
+            launched = batch.launch(state) if frame + 1 < frames else None
+            for index, run in runs.items():
+                if run.recording:
+                    run.record(state.scene(index), frame)
+                run.log.append(each[index].as_dict())
+            if launched is not None:
+                state, _ = launched.finish()
+                each = launched.each
+        for recorder in opened:
+            recorder.wait()
+        seconds = (time.perf_counter() - begin) / len(members)
+        found: list[dict[str, Any] | None] = [None] * len(members)
+        for index, run in runs.items():
+            drawn = sum(value for part, value in run.walls.read(wait=True).items() if part != "writing")
+            run.walls.seconds["simulation"] = max(seconds - drawn, 0.0)  # its share of what they took together
+            run.walls.seconds["startup"] = startup
+            found[index] = run.close("complete", None, state.scene(index), frames, dict(settings[index]))
+        return found
+    finally:
+        for recorder in opened:
+            recorder.release()
+
+
+class RecordedRun:
+    """The motion in the folder of a run, and the simulation of its configuration and splat.
+
+    Args:
+        folder: The output folder of ``gaussian-swaying sim``.
+
+    Attributes:
+        simulation: Made again, on the CPU.
+        summary: The summary of the run.
+
+    Raises:
+        ValueError: If there is no run, its splat is missing or another one, or it was made from Python.
+
+    Example:
+        >>> for gaussians in RecordedRun("outputs/flag").frames():  # doctest: +SKIP
+        ...     print(gaussians.means.mean(0))
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.summary = self._summary()
+        self.simulation, self.name = self._simulation()
+
+    def _summary(self) -> dict[str, Any]:
+        path = self.folder / "summary.json"
+        if not path.is_file() or not (self.folder / "config.yaml").is_file():
+            raise ValueError(f"{self.folder} has no run: give the output folder of `gaussian-swaying sim`.")
+        try:
+            summary: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+            summary["formulation"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path} cannot be read ({error}): run the simulation again.") from error
+        return summary
+
+    def _simulation(self) -> tuple[Simulation, str]:
+        config, parser = self.folder / "config.yaml", Simulation.parser()
+        try:
+            settings = parse_file(parser, config)
+        except ValueError as error:
+            python = "made_in_python" in config.read_text(encoding="utf-8", errors="replace")
+            why = "the run was made from Python" if python else str(error).rstrip(".")
+            raise ValueError(f"{config} cannot be read ({why}): run the simulation again from a file.") from error
+        splat = settings.scene.ply
+        if splat is not None:
+            if not Path(splat).is_file():
+                raise ValueError(
+                    f"The splat {splat} of the run is not there (`scene.ply` in {config}): put it back, or export from "
+                    "the folder in which the run was started."
+                )
+            if self.summary.get("splat_sha256") not in (None, sha256(Path(splat))):
+                raise ValueError(
+                    f"The splat {splat} has changed since the run in {self.folder}: restore it, or run again."
+                )
+        made = getattr(settings.scene.generator, "class_path", "scene").rsplit(".", 1)[-1].removesuffix("Scene")
+        return Simulation.from_settings(parser, settings, device="cpu"), made if splat is None else Path(splat).stem
+
+    @cached_property
+    def start(self) -> Any:
+        """The state at rest; raises the errors of :meth:`Simulation.start`."""
+        return self.simulation.start()
+
+    def nodes(self) -> tuple[Tensor, Tensor]:
+        """Flat indices (M,) of the recorded nodes in the grid of :attr:`start`, and their displacements [m] (K, M, 3).
+
+        Raises:
+            ValueError: If the run has none, or those of another version of the program.
+        """
+        path, formulation = self.folder / "nodes.npz", self.summary["formulation"]
+        if formulation not in ("total", "modes"):
+            raise ValueError(
+                f"The run in {self.folder} is of `solver.formulation: {formulation}`, where nodes do not move with the "
+                "material: a film needs a run of `total`."
+            )
+        if not path.is_file():
+            raise ValueError(f"The run in {self.folder} has no nodes.npz: run it again with `recorder.nodes: true`.")
+        displacement, nodes = load_nodes(path), self.simulation.scene.follow.nodes(self.start)
+        assert nodes is not None  # the run is of `total`
+        if displacement.shape[1] != len(nodes):
+            raise ValueError(
+                f"{path} has {displacement.shape[1]:,} nodes, but the scene of {self.folder / 'config.yaml'} has "
+                f"{len(nodes):,}: export with the version of this program that made the run, or run it again."
+            )
+        return nodes, displacement
+
+    @torch.inference_mode()
+    def frames(self) -> Iterator[DeformedGaussians]:
+        """All Gaussians in each frame, from ``nodes.npz`` or the trajectory.
+
+        Their colours are those of the edits so far, so read them before the next frame.
+        Displacements have the precision of the file: float16, 0.05 % of each, up to half of the object's size.
+
+        Raises:
+            ValueError: If the run recorded no motion.
+        """
+        states, scene, editor = self._states(), self.simulation.scene, self.simulation.editor
+        step = self.simulation.frame_dt
+        for frame, state in enumerate(states):
+            for edit in editor.due((frame + 1e-3) * step):
+                editor.apply(edit, flowed=frame > 0)
+            yield scene.deformed(state)
+
+    def _states(self) -> Iterator[Any]:
+        """What the Gaussians follow in each frame."""
+        start, trajectory = self.start, self.folder / "trajectory.npz"
+        if (self.folder / "nodes.npz").is_file():
+            nodes, displacement = self.nodes()
+            rest = torch.zeros_like(start.node_displacement)
+            for row in displacement.to(rest.dtype):
+                yield replace(start, node_displacement=rest.index_copy(0, nodes, row))
+        elif self.simulation.scene.track is None and trajectory.is_file():
+            for frame in sorted(packed_frames(trajectory)):
+                position, F = (part.to(start.position.dtype) for part in load_trajectory(trajectory, frame))
+                yield SimpleNamespace(position=position, F_total=F)
+        else:
+            name = "trajectory" if self.simulation.scene.track is None else "nodes"
+            raise ValueError(
+                f"The run in {self.folder} has no {name}.npz, which moves the Gaussians: run it again with "
+                f"`recorder.{name}: true`."
+            )
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Masks of Gaussians, shape (N,).
+
+    Attributes:
+        simulated: Those selected by region and opacity.
+        carried: Faint and loose ones that follow them.
+        pinned: Simulated ones that a condition holds.
+        pushed: Simulated ones that an impulse pushes.
+        names: The kind of each condition and the number of its particles, in words.
+    """
+
+    simulated: Tensor
+    carried: Tensor
+    pinned: Tensor
+    pushed: Tensor
+    names: list[str]
+
+
+def classify(simulation: Simulation) -> Roles:
+    """Sort the Gaussians into simulated, carried, held and pushed ones."""
+    scene = simulation.scene
+    simulated, carried, pinned, pushed = (torch.zeros(len(scene.model.means), dtype=torch.bool) for _ in range(4))
+    index = scene.simulated.cpu()
+    carried[scene.carried.cpu()] = True
+    simulated[index], carried[index] = True, False
+    where = scene.frame.point_to_sim(scene.model.means.detach()[scene.simulated].double()).to(
+        scene.points.position.dtype
+    )
+    names = []
+    for boundary in conditions(simulation):
+        moved = boundary.in_frame(scene.frame)
+        mask = moved.particle_mask(scene.points.position)
+        name = type(boundary).__name__
+        if mask is None:
+            names.append(name)
+            continue
+        own = moved.particle_mask(where)
+        assert own is not None
+        (pushed if boundary.held_share is None else pinned)[index[own.cpu()]] = True
+        names.append(f"{name}: {int(mask.sum()):,} particles")
+    return Roles(simulated, carried, pinned, pushed, names)
+
+
+def conditions(simulation: Simulation) -> list[Boundary]:
+    """The boundary conditions of a run, in scene units."""
+    return [b for b in simulation.solver.boundaries if isinstance(b, Boundary)]

@@ -14,7 +14,7 @@ from gaussian_swaying._files import sha256
 from gaussian_swaying._inputs import check_regular
 from gaussian_swaying._yaml_limits import read_fields
 from gaussian_swaying.config.parser import check_settings, config_text, option, parse_text
-from gaussian_swaying.simulation.parameters import POLAR, all_in_settings
+from gaussian_swaying.simulation.model import POLAR, all_in_settings
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.axes import read_axis, runs_of
 

@@ -7,10 +7,8 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from gaussian_swaying.config.parser import config_text
-from gaussian_swaying.simulation import parameters
-from gaussian_swaying.simulation.batch import run_batch
-from gaussian_swaying.simulation.parameters import find, in_settings
-from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.simulation.model import POLAR, find, in_settings, names
+from gaussian_swaying.simulation.simulation import Simulation, run_batch
 from gaussian_swaying.sweeps.backend import Job, unlocked
 from gaussian_swaying.sweeps.plan import parse_run
 from gaussian_swaying.sweeps.record import RUNS
@@ -19,7 +17,7 @@ if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
 
-OPTIONS = [name for name in parameters.names() if name not in parameters.POLAR and "*" not in name]
+OPTIONS = [name for name in names() if name not in POLAR and "*" not in name]
 """Parameters that are options of ``sim``."""
 
 

@@ -22,7 +22,7 @@ from gaussian_swaying._checks import first_line
 from gaussian_swaying._files import write_json
 from gaussian_swaying.runs.lock import FolderLocked
 from gaussian_swaying.runs.signals import stop_signals
-from gaussian_swaying.simulation.diagnostics import SimulationDiverged
+from gaussian_swaying.simulation.measure import SimulationDiverged
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.backend import Job, Outcome, unlocked
 from gaussian_swaying.sweeps.plan import parse_run

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 import yaml
 
-from gaussian_swaying.simulation.parameters import POLAR, all_in_settings, find, of_settings, parameter
+from gaussian_swaying.simulation.model import POLAR, all_in_settings, find, of_settings, parameter
 from gaussian_swaying.simulation.simulation import Simulation
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ import torch
 
 from gaussian_swaying.mpm.materials import MATERIALS, name_of
 from gaussian_swaying.rendering.passes import colormap
-from gaussian_swaying.simulation.parameters import POLAR, angles_of, flow_of, parameter, present, value_of
-from gaussian_swaying.simulation.wind_picture import speed_scale
+from gaussian_swaying.simulation.draw import speed_scale
+from gaussian_swaying.simulation.model import POLAR, angles_of, flow_of, parameter, present, value_of
 from gaussian_swaying.viewer.files import Files
 from gaussian_swaying.viewer.gusts import Gusts
 from gaussian_swaying.viewer.holding import Holding

@@ -15,7 +15,7 @@ from gaussian_swaying._devices import in_double
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.tints import by_role
-from gaussian_swaying.simulation.wind_picture import draw_wind
+from gaussian_swaying.simulation.draw import draw_wind
 from gaussian_swaying.viewer.session import Snapshot
 
 SHOWN = ("colour", "normals", "wind force")

@@ -10,7 +10,7 @@ from torch import Tensor
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.state import State
-from gaussian_swaying.simulation.simulated_scene import SimulatedScene
+from gaussian_swaying.simulation.body import SimulatedScene
 
 REACH = 0.06  # radius of what is grabbed, as a share of the longest side
 QUICK = 40.0  # 1/s: how quickly what is grabbed follows, if nothing else acts on it

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from gaussian_swaying.preview.cost import Cost, estimate_cost, predicted_spacing
 from gaussian_swaying.preview.suggest import QUALITIES
-from gaussian_swaying.simulation.extent import suggest_spacing
+from gaussian_swaying.simulation.body import suggest_spacing
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.changes import changed_settings
 

@@ -17,7 +17,7 @@ from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.rendering.gsplat_renderer import make_renderer
 from gaussian_swaying.rendering.thinning import DETAIL
-from gaussian_swaying.simulation.diagnostics import FrameDiagnostics, SimulationDiverged
+from gaussian_swaying.simulation.measure import FrameDiagnostics, SimulationDiverged
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.changes import changed_settings, take
 from gaussian_swaying.viewer.pull import Pull

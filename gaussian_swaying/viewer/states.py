@@ -14,7 +14,7 @@ from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.recording.nodes import split_far
 from gaussian_swaying.rendering.shading import DiffuseShader
 from gaussian_swaying.rendering.tints import by_role
-from gaussian_swaying.simulation.simulated_scene import SimulatedScene
+from gaussian_swaying.simulation.body import SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.film.page import message, pack_splats
 from gaussian_swaying.viewer.film.recorded import film_without_frames, look_of

@@ -9,7 +9,7 @@ from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.materials import MATERIALS
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.material import Material
+from gaussian_swaying.simulation.body import Material
 from gaussian_swaying.simulation.simulation import Simulation
 
 COTTON, LEAF = MATERIALS["cotton"], MATERIALS["leaf"]

@@ -41,7 +41,7 @@ from gaussian_swaying import (
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.material import MaterialRegion
+from gaussian_swaying.simulation.body import MaterialRegion
 from gaussian_swaying.wind.computed_air import ComputedAir
 from gaussian_swaying.wind.turbulence import Turbulence
 

@@ -22,7 +22,7 @@ from gaussian_swaying import (
     write_ply,
 )
 from gaussian_swaying.scenes import FlagScene
-from gaussian_swaying.simulation.batch import batch_of
+from gaussian_swaying.simulation.simulation import batch_of
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "python.md").read_text()

@@ -6,7 +6,7 @@ import torch
 from gaussian_swaying import AeroForce, Box, Edit, Material, MPMSolver, PinnedRegion, Simulation, SineSway, WindField
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.scenes import FlagScene
-from gaussian_swaying.simulation.material import MaterialRegion
+from gaussian_swaying.simulation.body import MaterialRegion
 from gaussian_swaying.wind.field import FlowKey
 
 VALUES = {"wind": 4.0, "E": 3e3, "nu": 0.3, "density": 30.0, "C_D": 0.5, "C_F": 0.4, "C_L": 0.1}

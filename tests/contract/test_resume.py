@@ -11,7 +11,7 @@ from gaussian_swaying.mpm.laws.elastic import NeoHookean
 from gaussian_swaying.mpm.laws.plastic import Sand, Snow
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes import FlagScene, GivenScene, SolidScene
-from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.body import Scene
 from gaussian_swaying.wind.computed_air import ComputedAir
 from gaussian_swaying.wind.field import GaussianGust, SineSway
 from gaussian_swaying.wind.tables import Shelter

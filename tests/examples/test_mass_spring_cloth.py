@@ -15,8 +15,8 @@ from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.geometry.regions import Sphere
 from gaussian_swaying.mpm.embedded import EmbeddedAtPoints
 from gaussian_swaying.recording.trajectory import load_trajectory
-from gaussian_swaying.simulation.batch import batch_of
-from gaussian_swaying.simulation.edits import Edit
+from gaussian_swaying.simulation.model import Edit
+from gaussian_swaying.simulation.simulation import batch_of
 from gaussian_swaying.viewer.session import Session
 
 BOX = {"min": [None, None, None], "max": [0.11, None, None]}

@@ -10,7 +10,7 @@ from gaussian_swaying.fitting.background import Background
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.rendering.cameras.camera import project
 from gaussian_swaying.scenes.procedural import GivenScene
-from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.body import Scene
 from gaussian_swaying.simulation.simulation import Simulation
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")

@@ -9,7 +9,7 @@ from small_films import TRUTH
 
 from gaussian_swaying.fitting.plan import read_unknown
 from gaussian_swaying.fitting.rivals import SCANNED, SHAKEN, apart_by, bent_alike, mirrored, rivals_of
-from gaussian_swaying.simulation.parameters import flow_of
+from gaussian_swaying.simulation.model import flow_of
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")
 

@@ -5,7 +5,7 @@ import torch
 from small_films import changed
 
 from gaussian_swaying.fitting.unknowns import Unknown, check_unknowns
-from gaussian_swaying.simulation.parameters import flow_of, with_values
+from gaussian_swaying.simulation.model import flow_of, with_values
 
 
 @pytest.mark.parametrize("scale", ["log", "linear"])

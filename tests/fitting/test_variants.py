@@ -10,7 +10,7 @@ from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation import stepper
+from gaussian_swaying.simulation import step
 from gaussian_swaying.wind.field import WindField
 from gaussian_swaying.wind.force import AeroForce, WindForce
 from gaussian_swaying.wind.patches import Patches
@@ -79,7 +79,7 @@ def test_what_leaves_the_grid_of_updated_gets_a_larger_one(tmp_path, monkeypatch
     (first,), (last,) = states_of(simulation, [{}], times)
     assert not bool(last.lost.any())
     assert float((last.position - first.position)[:, 0].mean()) > 0.57
-    monkeypatch.setattr(stepper, "MAX_RETRIES", 0)
+    monkeypatch.setattr(step, "MAX_RETRIES", 0)
     *_, (stopped,) = states_of(simulation, [{}], times, alike=False)
     assert bool(stopped.lost.any())
 

@@ -18,7 +18,7 @@ from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.body import Scene
 
 # half a step of 8 bits each: the logarithm of the size, opacities, colours; harmonics are rounded once more, to 4 bits
 SPZ = {"scales": 1.01 / 32, "opacities": 0.501 / 255, "colors": 0.501 / 255 / 0.15, "sh": 8.51 / 128}

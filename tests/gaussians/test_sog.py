@@ -20,7 +20,7 @@ from gaussian_swaying.gaussians import sog
 from gaussian_swaying.gaussians.export import export_cloud
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.sog import read_sog
-from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.body import Scene
 
 # a component has steps of sqrt(2) / 255, and three of them are off; the fourth, at least 1/2, follows from them
 STEP = 2**0.5 / 255

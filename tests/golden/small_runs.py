@@ -15,7 +15,7 @@ from gaussian_swaying import Force, GaussianCloud, Simulation, write_ply
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.rendering.torch_renderer import TorchRenderer
 from gaussian_swaying.scenes import FlagScene
-from gaussian_swaying.simulation.batch import batch_of
+from gaussian_swaying.simulation.simulation import batch_of
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 SPACING, SPARSE = "scene.generator.init_args.spacing", "scene.generator.init_args.leaves"

@@ -15,8 +15,8 @@ from shared import SMALL, refused, words
 from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.recording import recorder
 from gaussian_swaying.recording.trajectory import load_trajectory
-from gaussian_swaying.simulation.diagnostics import SimulationDiverged
-from gaussian_swaying.simulation.run import Run
+from gaussian_swaying.simulation.measure import SimulationDiverged
+from gaussian_swaying.simulation.record import Run
 
 FRAMES = 6
 

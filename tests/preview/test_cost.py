@@ -17,7 +17,7 @@ from gaussian_swaying.preview import cost as cost_module
 from gaussian_swaying.preview.cost import estimate_cost, finest_within, scaled_seconds, with_whole
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.material import Material
+from gaussian_swaying.simulation.body import Material
 from gaussian_swaying.simulation.simulation import Simulation
 
 FRAMES = 101

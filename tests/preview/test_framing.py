@@ -15,7 +15,7 @@ from gaussian_swaying.preview.suggest import suggest
 from gaussian_swaying.preview.ticks import COLOUR, draw_ticks, nice_ticks
 from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.roles import classify
+from gaussian_swaying.simulation.simulation import classify
 
 
 def column(count=3000, side=0.3, height=2.0):

@@ -26,8 +26,7 @@ from gaussian_swaying.preview.suggest import suggest
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.rendering.torch_renderer import render_torch
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.roles import Roles, classify
-from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.simulation.simulation import Roles, Simulation, classify
 from gaussian_swaying.wind.field import FlowKey, WindField
 
 POLE = Box([None, None, None], [0.11, None, None])

@@ -38,7 +38,7 @@ from gaussian_swaying.preview.suggest import (
 from gaussian_swaying.preview.up import floor_mask, guess_up
 from gaussian_swaying.scenes.leaves import LeavesScene
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.extent import suggest_spacing
+from gaussian_swaying.simulation.body import suggest_spacing
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.wind.turbulence import LOOKS
 

@@ -34,7 +34,7 @@ from gaussian_swaying.mpm.colliders import EnclosingBox, Plane, VelocityBox
 from gaussian_swaying.mpm.laws import LAWS as KINDS
 from gaussian_swaying.mpm.pins import Handle
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
-from gaussian_swaying.simulation.diagnostics import measure
+from gaussian_swaying.simulation.measure import measure
 from gaussian_swaying.wind.field import FlowKey, Modulation
 
 FORMULATIONS = ["total", "updated"]

@@ -17,7 +17,7 @@ from gaussian_swaying.recording.checkpoint import log_lines, read_checkpoint
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
 from gaussian_swaying.runs.saved import save_whole
-from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.body import Scene
 from gaussian_swaying.simulation.simulation import Simulation
 
 QUIET = {"images": False, "video": False}

@@ -28,8 +28,8 @@ from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.recording.video import VideoEncoder, encode_video
 from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.diagnostics import SimulationDiverged
-from gaussian_swaying.simulation.run import Run
+from gaussian_swaying.simulation.measure import SimulationDiverged
+from gaussian_swaying.simulation.record import Run
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.wind.field import WindField
 

@@ -8,9 +8,9 @@ from shared import advanced
 
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.pins import PinnedRegion
-from gaussian_swaying.simulation.batch import batch_of
-from gaussian_swaying.simulation.edits import Edit
-from gaussian_swaying.simulation.material import Material
+from gaussian_swaying.simulation.body import Material
+from gaussian_swaying.simulation.model import Edit
+from gaussian_swaying.simulation.simulation import batch_of
 from gaussian_swaying.wind.field import WindField
 from gaussian_swaying.wind.force import AeroForce, added_mass_per_area
 

@@ -13,9 +13,7 @@ from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.preview.apart import why_apart
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
-from gaussian_swaying.simulation.attached import attached_points, homes, lies_apart, pieces_in_cells
-from gaussian_swaying.simulation.material import Material
-from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.body import Material, Scene, attached_points, homes, lies_apart, pieces_in_cells
 from gaussian_swaying.simulation.simulation import Simulation
 
 DX, GAP = 0.2, 0.13

@@ -15,10 +15,8 @@ from gaussian_swaying.mpm.contact import Contact
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.cloths import ClothScene
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
-from gaussian_swaying.simulation.material import Material
-from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.body import Material, Scene, still_distance
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.simulation.touching import still_distance
 
 
 def _ball(contact=None, boundaries=None, **more):

@@ -23,12 +23,9 @@ from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera
 from gaussian_swaying.rendering.shading import DiffuseShader
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
-from gaussian_swaying.simulation.batch import batch_of
-from gaussian_swaying.simulation.copies import Copy
-from gaussian_swaying.simulation.edits import Edit
-from gaussian_swaying.simulation.material import Material
-from gaussian_swaying.simulation.scene import Scene
-from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.simulation.body import Material, Scene
+from gaussian_swaying.simulation.model import Copy, Edit
+from gaussian_swaying.simulation.simulation import Simulation, batch_of
 from gaussian_swaying.wind.field import FlowKey, GaussianGust, SpatialWind, UniformGust, WindField
 from gaussian_swaying.wind.tables import Shelter
 

@@ -14,7 +14,7 @@ from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
-from gaussian_swaying.simulation.diagnostics import (
+from gaussian_swaying.simulation.measure import (
     FrameDiagnostics,
     SimulationDiverged,
     TearingGauge,

@@ -12,8 +12,8 @@ from gaussian_swaying.mpm.laws.elastic import FixedCorotated, NeoHookean
 from gaussian_swaying.mpm.laws.plastic import Foam, Plasticine, Sand
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.recording.recorder import Recorder
-from gaussian_swaying.simulation.edits import Edit, edited_points, recolored
-from gaussian_swaying.simulation.material import Material, MaterialRegion
+from gaussian_swaying.simulation.body import Material, MaterialRegion
+from gaussian_swaying.simulation.model import Edit, edited_points, recolored
 from gaussian_swaying.wind.field import WindField
 from gaussian_swaying.wind.force import AeroForce
 

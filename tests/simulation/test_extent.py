@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gaussian_swaying.simulation.extent import check_density, check_extent, coarse, narrow
+from gaussian_swaying.simulation.body import check_density, check_extent, coarse, narrow
 
 
 def cube(count=1000):

@@ -35,7 +35,7 @@ from gaussian_swaying.mpm.colliders import HalfSpaceObstacle
 from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.mpm.pins import Impulse
 from gaussian_swaying.scenes import FlagScene
-from gaussian_swaying.simulation.normalisation import Normalisation
+from gaussian_swaying.simulation.model import Normalisation
 
 POLE = Box([None, None, None], [0.11, None, None])
 SMALL = {"hold": POLE, "material": Material(E=3e3, density=30.0), "wind": [6.0, 1.5, 0.0], "device": "cpu"}

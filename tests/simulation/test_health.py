@@ -7,9 +7,9 @@ import torch
 
 from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.recording.recorder import Recorder
-from gaussian_swaying.simulation.health import advice, extremes
-from gaussian_swaying.simulation.material import Material
-from gaussian_swaying.simulation.run import run_health
+from gaussian_swaying.simulation.body import Material
+from gaussian_swaying.simulation.measure import advice, extremes
+from gaussian_swaying.simulation.record import run_health
 
 WHERE = torch.tensor([[0.0, 0, 0], [1.0, 2, 3], [4.0, 5, 6]])
 

@@ -10,11 +10,9 @@ from small_scenes import together
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
-from gaussian_swaying.simulation.batch import batch_of
-from gaussian_swaying.simulation.edits import Edit
-from gaussian_swaying.simulation.material import Material
-from gaussian_swaying.simulation.scene import Scene
-from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.simulation.body import Material, Scene
+from gaussian_swaying.simulation.model import Edit
+from gaussian_swaying.simulation.simulation import Simulation, batch_of
 
 DX = 0.1
 

@@ -13,8 +13,7 @@ from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
-from gaussian_swaying.simulation.material import Material, MaterialRegion
-from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.body import Material, MaterialRegion, Scene
 from gaussian_swaying.simulation.simulation import Simulation
 
 CLOUD = FlagScene(spacing=0.04).generate()

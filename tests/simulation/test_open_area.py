@@ -11,9 +11,7 @@ from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.rotations import rotation_to_quat
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.material import Material
-from gaussian_swaying.simulation.scene import Scene
-from gaussian_swaying.simulation.simulated_scene import SimulatedScene
+from gaussian_swaying.simulation.body import Material, Scene, SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
 
 

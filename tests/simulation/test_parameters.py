@@ -16,10 +16,10 @@ from gaussian_swaying.fitting.variants import states_of
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation import parameters
-from gaussian_swaying.simulation.edits import Edit
-from gaussian_swaying.simulation.material import Material
-from gaussian_swaying.simulation.parameters import (
+from gaussian_swaying.simulation import model
+from gaussian_swaying.simulation.body import Material, Scene
+from gaussian_swaying.simulation.model import (
+    Edit,
     in_settings,
     of_settings,
     parameter,
@@ -27,7 +27,6 @@ from gaussian_swaying.simulation.parameters import (
     value_of,
     with_values,
 )
-from gaussian_swaying.simulation.scene import Scene
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep
 from gaussian_swaying.sweeps.together import grouped
@@ -39,7 +38,7 @@ CONFIG["solver"]["damping"] = 0.5
 CONFIG["wind"]["modulations"] = [{"class_path": name} for name in ("SineSway", "UniformGust", "GaussianGust")]
 OTHERS = {"wind.flow": [1.0, 2.0, 0.5], "wind.seed": 7, "solver.gravity": [0.0, 0.0, -1.0], "material.nu": 0.1}
 PLACES = {"amplitude": 0, "period": 0, "phase": 0, "delta": 1, "std": 2, "interval": 1}
-NAMES = [name.replace("*", str(PLACES.get(name.split(".")[-1], 0))) for name in parameters.names()]
+NAMES = [name.replace("*", str(PLACES.get(name.split(".")[-1], 0))) for name in model.names()]
 
 
 @pytest.fixture
@@ -60,7 +59,7 @@ def breath(tmp_path, monkeypatch):
     code = (
         "import torch\n"
         "from gaussian_swaying.mpm.forces import Force\n"
-        "from gaussian_swaying.simulation.parameters import register\n\n"
+        "from gaussian_swaying.simulation.model import register\n\n"
         "class Breath(Force):\n"
         "    def __init__(self, strength: float = 0.1) -> None:\n"
         "        super().__init__()\n"
@@ -74,7 +73,7 @@ def breath(tmp_path, monkeypatch):
     path = tmp_path / "breath.yaml"
     path.write_text(yaml.safe_dump(CONFIG | {"forces": [{"class_path": "users_breath.Breath"}]}))
     yield path
-    parameters._KNOWN.pop("forces.Breath.strength", None)
+    model._KNOWN.pop("forces.Breath.strength", None)
     sys.modules.pop("users_breath", None)
 
 

@@ -17,12 +17,9 @@ from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.leaves import LeavesScene
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
 from gaussian_swaying.scenes.solid import SolidScene
-from gaussian_swaying.simulation.diagnostics import measure
-from gaussian_swaying.simulation.edits import Edit
-from gaussian_swaying.simulation.material import Material, MaterialRegion
-from gaussian_swaying.simulation.sampling import matched_points
-from gaussian_swaying.simulation.scene import Scene
-from gaussian_swaying.simulation.simulated_scene import SimulatedScene
+from gaussian_swaying.simulation.body import Material, MaterialRegion, Scene, SimulatedScene, matched_points
+from gaussian_swaying.simulation.measure import measure
+from gaussian_swaying.simulation.model import Edit
 from gaussian_swaying.wind.field import WindField
 from gaussian_swaying.wind.force import AeroForce, WindForce
 

@@ -9,11 +9,10 @@ from shared import SMALL, refused, words
 from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
-from gaussian_swaying.simulation import progress as progress_module
-from gaussian_swaying.simulation import stepper
-from gaussian_swaying.simulation.painter import Painter
-from gaussian_swaying.simulation.progress import RunProgress
-from gaussian_swaying.simulation.run import MAX_LOOKS
+from gaussian_swaying.simulation import measure, step
+from gaussian_swaying.simulation.draw import Painter
+from gaussian_swaying.simulation.measure import RunProgress
+from gaussian_swaying.simulation.record import MAX_LOOKS
 
 FLAG = Path(__file__).parents[2] / "configs/sim/flag.yaml"
 RUN = [f"--config={FLAG}", "--device=cpu", *words(SMALL | {"solver.boundaries": [], "material.E": 9e3, "frames": 3})]
@@ -26,7 +25,7 @@ def clock(monkeypatch):
     class Clock:
         now = 0.0
 
-    monkeypatch.setattr(progress_module.time, "perf_counter", lambda: Clock.now)
+    monkeypatch.setattr(measure.time, "perf_counter", lambda: Clock.now)
     return Clock
 
 
@@ -122,7 +121,7 @@ def test_what_has_no_end_or_place_is_refused(arguments, words, tmp_path, capsys)
 
 
 def test_a_frame_that_gets_too_many_substeps_ends_the_run(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(stepper, "MAX_SUBSTEPS", 20)
+    monkeypatch.setattr(step, "MAX_SUBSTEPS", 20)
     assert main([*RUN, "--wind.flow", "[300, 0, 0]", "--output", str(tmp_path / "run")]) == 2
     said = capsys.readouterr().err
     assert "substeps, more than the limit of 20" in said
@@ -137,7 +136,7 @@ def test_the_cameras_of_as_many_frames_as_there_may_be(tmp_path, monkeypatch):
     def stop(self):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(stepper.Stepper, "start", stop)
+    monkeypatch.setattr(step.Stepper, "start", stop)
     assert main([*RUN, "--frames", "10000000", "--output", str(tmp_path / "run")]) == 130
     assert len(seen) == MAX_LOOKS
     assert (seen[0], seen[-1]) == (0, 9_999_999)

@@ -19,8 +19,7 @@ from gaussian_swaying.gaussians.ply import read_ply, write_ply
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.recorded import RecordedRun
-from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.simulation.simulation import RecordedRun, Simulation
 
 FRAMES = 4
 

@@ -13,7 +13,7 @@ from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera
 from gaussian_swaying.rendering.passes import colormap, mean_depth
 from gaussian_swaying.rendering.shading import DiffuseShader
-from gaussian_swaying.simulation.edits import Edit
+from gaussian_swaying.simulation.model import Edit
 from gaussian_swaying.wind.field import WindField
 from gaussian_swaying.wind.force import AeroForce
 

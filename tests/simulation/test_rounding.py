@@ -6,7 +6,7 @@ import torch
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.timestep import rounding_speed
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.material import Material
+from gaussian_swaying.simulation.body import Material
 from gaussian_swaying.simulation.simulation import Simulation
 
 

@@ -7,7 +7,7 @@ import torch
 
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.simulation.sampling import Samples, grouped
+from gaussian_swaying.simulation.body import Samples, grouped
 
 DOUBLE = torch.float64
 FRAME = SimFrame(torch.zeros(3, dtype=DOUBLE), torch.eye(3, dtype=DOUBLE), 0.5)

@@ -18,11 +18,8 @@ from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation import body
-from gaussian_swaying.simulation.edits import Edit
-from gaussian_swaying.simulation.material import Material, MaterialRegion
-from gaussian_swaying.simulation.sampling import cell_volume
-from gaussian_swaying.simulation.scene import Scene
-from gaussian_swaying.simulation.simulated_scene import SimulatedScene
+from gaussian_swaying.simulation.body import Material, MaterialRegion, Scene, SimulatedScene, cell_volume
+from gaussian_swaying.simulation.model import Edit
 
 LEFT = Box([None, None, None], [0.5, None, None])
 UPS = [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [0.3, -0.7, 0.2]]

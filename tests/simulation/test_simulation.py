@@ -21,10 +21,9 @@ from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer, make_rend
 from gaussian_swaying.rendering.shading import DiffuseShader, PhongShader
 from gaussian_swaying.rendering.torch_renderer import render_torch
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.diagnostics import SimulationDiverged, measure
-from gaussian_swaying.simulation.edits import Edit
-from gaussian_swaying.simulation.material import Material
-from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.body import Material, Scene
+from gaussian_swaying.simulation.measure import SimulationDiverged, measure
+from gaussian_swaying.simulation.model import Edit
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.wind.field import GaussianGust, SineSway, WindField
 from gaussian_swaying.wind.force import AeroForce
@@ -398,7 +397,7 @@ def test_many_still_gaussians_are_coloured_once(degree, shader, make_cloud, make
         for camera in cameras:
             expected = painter.colors(gaussians, camera)
             with monkeypatch.context() as patch:
-                patch.setattr("gaussian_swaying.simulation.painter.RECORDED", 7)
+                patch.setattr("gaussian_swaying.simulation.draw.RECORDED", 7)
                 for _ in range(2):
                     torch.testing.assert_close(painter.colors(gaussians, camera), expected, rtol=0, atol=1e-6)
                     assert painter._rest[0] is camera
@@ -410,7 +409,7 @@ def test_many_still_gaussians_are_coloured_once(degree, shader, make_cloud, make
 @pytest.fixture
 def many_still(make_cloud, make_simulation, monkeypatch):
     """A function that makes a run whose colours of what does not move are kept."""
-    monkeypatch.setattr("gaussian_swaying.simulation.painter.RECORDED", 7)
+    monkeypatch.setattr("gaussian_swaying.simulation.draw.RECORDED", 7)
     part = {"region": Box([None] * 3, [0.6, None, None])}
     return lambda: make_simulation(make_cloud(degree=1), pinned=False, scene=part)
 

@@ -15,10 +15,7 @@ from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
 from gaussian_swaying.scenes.solid import SolidScene
-from gaussian_swaying.simulation.material import Material, MaterialRegion
-from gaussian_swaying.simulation.sampling import cell_volume
-from gaussian_swaying.simulation.scene import Scene
-from gaussian_swaying.simulation.simulated_scene import SimulatedScene
+from gaussian_swaying.simulation.body import Material, MaterialRegion, Scene, SimulatedScene, cell_volume
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.wind.field import WindField
 

@@ -5,7 +5,7 @@ import torch
 from shared import waits
 
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.simulation.stepper import parts_of
+from gaussian_swaying.simulation.step import parts_of
 from gaussian_swaying.wind.effects import EllipsoidObstacle, LogProfile
 from gaussian_swaying.wind.field import WindField
 from gaussian_swaying.wind.tables import Shelter

@@ -10,8 +10,8 @@ from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
 from gaussian_swaying.rendering.passes import mean_depth
 from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.simulation.draw import STEPS, draw_vorticity, draw_wind, streaks
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.simulation.wind_picture import STEPS, draw_vorticity, draw_wind, streaks
 from gaussian_swaying.wind.computed_air import ComputedAir
 from gaussian_swaying.wind.effects import EllipsoidObstacle
 from gaussian_swaying.wind.field import WindField

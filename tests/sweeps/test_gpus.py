@@ -10,8 +10,7 @@ import torch
 from shared import advanced
 
 from gaussian_swaying.cli.sweep import main
-from gaussian_swaying.simulation.batch import batch_of
-from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.simulation.simulation import Simulation, batch_of
 from gaussian_swaying.sweeps.backend import Job
 from gaussian_swaying.sweeps.plan import make_plan, read_sweep
 from gaussian_swaying.sweeps.together import members_of

@@ -8,9 +8,8 @@ import torch
 
 from gaussian_swaying.cli.sweep import main
 from gaussian_swaying.config.parser import config_text
-from gaussian_swaying.simulation.batch import batch_of
-from gaussian_swaying.simulation.parameters import in_settings
-from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.simulation.model import in_settings
+from gaussian_swaying.simulation.simulation import Simulation, batch_of
 from gaussian_swaying.sweeps.backend import Job
 from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep
 from gaussian_swaying.sweeps.together import grouped, members_of, texts

@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from gaussian_swaying.geometry.rotations import rotation_to_quat
-from gaussian_swaying.simulation.wind_picture import draw_wind
+from gaussian_swaying.simulation.draw import draw_wind
 from gaussian_swaying.viewer.film_strip import FilmStrip
 from gaussian_swaying.viewer.pictures import SHOWN, PictureSize, camera_of, draw, enlarged, under_cursor
 

@@ -12,7 +12,7 @@ from gaussian_swaying.air.flow import SOUND
 from gaussian_swaying.air.immersed import look
 from gaussian_swaying.kernels.graphs import Replayed
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene, both
-from gaussian_swaying.simulation.stepper import why_not_batched
+from gaussian_swaying.simulation.step import why_not_batched
 from gaussian_swaying.wind.computed_air import BYTES, ComputedAir, resolution
 from gaussian_swaying.wind.effects import EllipsoidObstacle, LogProfile
 from gaussian_swaying.wind.field import FlowKey

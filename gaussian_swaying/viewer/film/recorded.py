@@ -19,10 +19,9 @@ from gaussian_swaying.mpm.transfer import Stencil
 from gaussian_swaying.mpm.virtual_nodes import coordinates
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.shading import DiffuseShader
-from gaussian_swaying.simulation.painter import Painter
-from gaussian_swaying.simulation.recorded import RecordedRun
-from gaussian_swaying.simulation.simulated_scene import SimulatedScene
-from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.simulation.body import SimulatedScene
+from gaussian_swaying.simulation.draw import Painter
+from gaussian_swaying.simulation.simulation import RecordedRun, Simulation
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from gaussian_swaying.mpm.laws.law import lame_parameters
 from gaussian_swaying.mpm.laws.plastic import Foam, Metal, Plasticine, Sand, Snow
 from gaussian_swaying.mpm.pins import Handle, PinnedRegion, SequentialRelease
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.normalisation import Normalisation
+from gaussian_swaying.simulation.model import Normalisation
 from gaussian_swaying.simulation.simulation import Simulation
 
 PARSER = Simulation.parser()

@@ -24,7 +24,7 @@ from gaussian_swaying.mpm.colliders import BallObstacle, EnclosingBox, Plane, Ve
 from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.mpm.pins import Handle
 from gaussian_swaying.mpm.state import GridSpec
-from gaussian_swaying.simulation.diagnostics import measure
+from gaussian_swaying.simulation.measure import measure
 from gaussian_swaying.wind.field import FlowKey
 
 from .bodies import (

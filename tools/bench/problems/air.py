@@ -18,8 +18,7 @@ from gaussian_swaying.kernels.graphs import Replayed
 from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.material import Material
-from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.body import Material, Scene
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.wind.computed_air import ComputedAir
 from gaussian_swaying.wind.field import FlowKey, WindField

@@ -21,8 +21,7 @@ from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.patches import sheet, to_cloud
 from gaussian_swaying.scenes.procedural import ProceduralScene
-from gaussian_swaying.simulation.material import Material
-from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.body import Material, Scene
 from gaussian_swaying.simulation.simulation import Simulation
 
 DISC, FABRIC = 0.09, 0.15

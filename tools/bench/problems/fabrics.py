@@ -16,8 +16,7 @@ from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.material import Material
-from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.body import Material, Scene
 from gaussian_swaying.simulation.simulation import Simulation
 
 FABRICS = {"interlock": (0.187, 23e-6), "rib": (0.276, 46e-6), "ponte": (0.284, 36e-6), "denim": (0.324, 64e-6)}

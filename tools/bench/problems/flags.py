@@ -10,7 +10,7 @@ from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
-from gaussian_swaying.simulation.diagnostics import TearingGauge
+from gaussian_swaying.simulation.measure import TearingGauge
 from gaussian_swaying.wind.field import SineSway, WindField
 from gaussian_swaying.wind.force import AeroForce
 

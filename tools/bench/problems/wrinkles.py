@@ -25,8 +25,7 @@ from gaussian_swaying.mpm.pins import Handle, PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.material import Material
-from gaussian_swaying.simulation.scene import Scene
+from gaussian_swaying.simulation.body import Material, Scene
 from gaussian_swaying.simulation.simulation import Simulation
 
 WIDTH, THICK = 0.2, 0.5e-3  # m; the thickness only shares E h and density h

@@ -15,7 +15,7 @@ import torch
 
 from bench.runner import ROOT, Row, study
 from bench.speed.timing import seconds
-from gaussian_swaying.simulation.frame import frames_from
+from gaussian_swaying.simulation.draw import frames_from
 from gaussian_swaying.simulation.simulation import Simulation
 
 FLAG = ROOT / "configs" / "sim" / "flag.yaml"

@@ -2,54 +2,182 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import operator
 import warnings
 import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import NoReturn
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from gaussian_swaying._devices import in_double
 from gaussian_swaying._fixed import assign
 from gaussian_swaying._turns import Turn, in_turn
 from gaussian_swaying.geometry.patches import deform_patch
+from gaussian_swaying.geometry.regions import whereabouts
 from gaussian_swaying.kernels.graphs import fingerprint, tensors_in
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.joints import Joints
 from gaussian_swaying.mpm.modes import MOST_LEAN, Modes
-from gaussian_swaying.mpm.pins import Impulse, RigidRegion
+from gaussian_swaying.mpm.pins import Impulse, PinnedPoints, PinnedRegion, RigidRegion
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, State
 from gaussian_swaying.mpm.timestep import MAX_CFL, rounding_speed, stable_limit
-from gaussian_swaying.simulation.copies import Copies
-from gaussian_swaying.simulation.diagnostics import (
+from gaussian_swaying.recording.recorder import Recorder
+from gaussian_swaying.simulation.body import SimulatedScene
+from gaussian_swaying.simulation.measure import (
     FrameDiagnostics,
     Gauge,
     Measurement,
+    RunProgress,
     SimulationDiverged,
     TearingGauge,
     check_spacing,
     measure,
 )
-from gaussian_swaying.simulation.parameters import Setup
-from gaussian_swaying.simulation.progress import RunProgress
-from gaussian_swaying.simulation.simulated_scene import SimulatedScene
+from gaussian_swaying.simulation.model import Copy, Edit, Setup, edited_points, recolored
 from gaussian_swaying.wind.computed_air import AirInBox
 from gaussian_swaying.wind.field import WindField
-from gaussian_swaying.wind.force import AirLift, Wind, WindForce, carried_mass, with_added_mass
+from gaussian_swaying.wind.force import AirLift, Places, Wind, WindForce, carried_mass, with_added_mass
 from gaussian_swaying.wind.patches import Patches
 from gaussian_swaying.wind.tables import Shelter
 
+RENDERS = ("color", "depth", "normal")
+"""Renders of a run with copies."""
+
+
+class Copies(nn.Module):
+    """The copies of a scene: ``x`` of the object lies at ``A x + b`` in each copy.
+
+    Args:
+        copies: The copies.
+        scene: The scene.
+        boundaries: The boundaries of the solver; the turns are about what its pins hold.
+
+    Attributes:
+        places: Their places in the wind.
+        rotation: ``A``, the rotation along the axes of the scene, shape (B, 3, 3), float64.
+        offset: ``b`` [scene units], shape (B, 3), float64.
+    """
+
+    def __init__(self, copies: Sequence[Copy], scene: SimulatedScene, boundaries: Iterable[nn.Module] = ()) -> None:
+        super().__init__()
+        self.copies, frame = tuple(copies), scene.frame
+        eye, axes = torch.eye(3, dtype=torch.float64), frame.rotation
+        turn = torch.stack([_turn(copy.turn) for copy in copies])
+        shift = torch.tensor([copy.shift for copy in copies], dtype=torch.float64)
+        shift = shift + (eye - turn) @ _foot(scene, boundaries)
+        rotation = eye + axes.T @ (turn - eye) @ axes  # exactly I where the copy is not turned
+        offset = (eye - rotation) @ frame.origin + shift @ axes / frame.metres_per_unit
+        delay = torch.tensor([copy.delay for copy in copies], dtype=torch.float64)
+        self.places = Places(turn, shift, delay)
+        for name, value in {"rotation": rotation, "offset": offset}.items():
+            self.register_buffer(name, value, persistent=False)
+        self.rotation: Tensor
+        self.offset: Tensor
+
+    def __len__(self) -> int:
+        return len(self.copies)
+
+    def winds(self, wind: Wind) -> Wind | Sequence[Wind]:
+        """The wind of the object with the gusts of each copy."""
+        if not isinstance(wind, WindField):
+            return [wind] * len(self)
+        own = int(wind.seed)
+        return wind.with_seeds([
+            copy.seed if copy.seed is not None else own + number * (copy.delay == 0)
+            for number, copy in enumerate(self.copies)
+        ])  # fmt: skip
+
+    def place(self, copy: int, points: Tensor) -> Tensor:
+        """Points (..., 3) of the object as they lie in a copy [scene units]; computed in float64, for far copies."""
+        return (in_double(points) @ self.rotation[copy].mT + self.offset[copy]).to(points)
+
+    def in_object(self, point: Tensor) -> Tensor:
+        """The points of the object that lie at a point (3,) of the scene in each copy [scene units], shape (B, 3)."""
+        found: Tensor = ((point.to(self.offset) - self.offset)[:, None] @ self.rotation)[:, 0]
+        return found
+
+
+def copies_of(copies: Sequence[Copy], setup: Setup, solver: Solver) -> Copies:
+    """The copies of the object of a simulation.
+
+    Args:
+        copies: The copies.
+        setup: Scene, material and drivers of the object.
+        solver: Its solver.
+    """
+    why = _why_not(copies, setup, solver)
+    if why is not None:
+        raise ValueError(why)
+    return Copies(copies, setup.scene, solver.boundaries)
+
+
+def _why_not(copies: Sequence[Copy], setup: Setup, solver: Solver) -> str | None:
+    wind = setup.wind
+    if setup.air is not None:
+        return "`copies` cannot have computed air yet, which belongs to one object: set `air` to null."
+    if setup.scene.surface_places is not None:
+        return "`copies` cannot touch anything yet: set `contact` to null, and remove obstacles from the solver."
+    if setup.forces:
+        return "`copies` cannot have `forces` yet, as these act on one object: remove them."
+    if isinstance(wind, WindField) and any(isinstance(effect, Shelter) for effect in wind.effects):
+        return "`copies` cannot have a Shelter yet, which belongs to one object: remove it from `wind.effects`."
+    if any(copy.seed is not None for copy in copies) and not isinstance(wind, WindField):
+        return "Expected `copies.seed` null with a wind of your own, which has no seed: use `delay`."
+    if any(copy.turn for copy in copies) and any(solver.gravity[:2]):
+        return "`copies` with a `turn` need `solver.gravity` along z: each is simulated in its own turned axes."
+    return None
+
+
+def check_recorder(recorder: Recorder) -> None:
+    """Raise ValueError if a recorder writes what runs with copies do not have."""
+    wrong = [name for name in ("trajectory", "nodes") if getattr(recorder, name)]
+    if wrong:
+        names = " and ".join(f"`recorder.{name}`" for name in wrong)
+        raise ValueError(f"`copies` are recorded as pictures only: set {names} to false.")
+    wrong = [render for render in recorder.renders if render not in RENDERS]
+    if wrong:
+        raise ValueError(f"`copies` have no pictures of {' and '.join(wrong)} yet: remove it from `recorder.renders`.")
+
+
+def _turn(degrees: float) -> Tensor:
+    """Rotation about z, shape (3, 3), float64."""
+    s, c = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
+    return torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
+def _foot(scene: SimulatedScene, boundaries: Iterable[nn.Module]) -> Tensor:
+    """Middle of what the pins hold [m], or of the object, shape (3,), float64."""
+    points = scene.points.position.detach().double()
+    held = []
+    for pin in boundaries:
+        if isinstance(pin, PinnedPoints):
+            held.append(scene.frame.point_to_sim(pin.at))
+        elif isinstance(pin, PinnedRegion):
+            held.append(points[pin.region.contains(scene.frame.point_to_scene(points))])
+    found = torch.cat(held) if held else points[:0]
+    if not len(found):
+        return torch.zeros(3, dtype=torch.float64)
+    low, high = found.aminmax(dim=0)
+    return 0.5 * (low + high)
+
+
 CFL_SAMPLES = 8  # checks per frame, as material may stiffen and soften again within it
+
 MAX_WIND = 1e6  # m/s; anything above is a mistake and would overflow positions
+
 MAX_GROWTH = 1000  # a frame that takes this many times the substeps of the first ends the run
+
 MAX_SUBSTEPS = 1_000_000  # per frame: hours on a CPU, and minutes on the fastest GPU
+
 MAX_RETRIES = 4  # of a frame
+
 CFL_LIMIT = 0.5  # an adaptive frame that exceeds it is repeated with shorter substeps
 
 ROUNDING_SHARE = 0.5
@@ -695,3 +823,186 @@ def _warn_falling(solver: Solver) -> None:
             UserWarning,
             stacklevel=3,
         )
+
+
+class SceneEditor:
+    """Applies edits to the scene of a stepper, in order of their times, and can undo them.
+
+    Args:
+        stepper: The stepper; its scene and material are changed.
+        edits: The edits. Those with the same time are applied in the given order, so that later entries win.
+
+    Raises:
+        ValueError: If the region of an edit contains nothing that it could change.
+    """
+
+    def __init__(self, stepper: Stepper, edits: Sequence[Edit] = ()) -> None:
+        self.stepper, self.scene = stepper, stepper.scene
+        self.edits = sorted(edits, key=lambda edit: edit.time)
+        self.applied = 0
+        self.version = 0  # counts the changes of colour
+        self._loaded: tuple[MaterialPoints, Tensor, Tensor] | None = None
+        for edit in self.edits:
+            self.reach(edit)
+
+    # ---- with the stepper
+
+    def start(self) -> State:
+        """The state at rest at time zero, with the edits of that time applied."""
+        self.reset()
+        for later in (moment for moment in self.times if moment > 0):  # refuse impossible edits now
+            self._apply_all(self.due(0.0))
+            self._apply_all(self.due(later), flowed=True)
+            self._pass_on()
+            self.stepper.rehearse()
+        self.reset()
+        self._apply_all(self.due(0.0))
+        self._pass_on()
+        return self.stepper.start()
+
+    def edit(self, state: State, edits: Sequence[Edit]) -> State:
+        """Apply edits now, whatever their time; if one is not possible, nothing changes.
+
+        Args:
+            state: The state now.
+            edits: The changes, in this order.
+
+        Returns:
+            The state from which the run continues.
+        """
+        before = self.snapshot()
+        try:
+            return self._go_on(state, edits)
+        except Exception:
+            self.restore(before)
+            self._pass_on()
+            self.stepper.bind()
+            raise
+
+    def edit_due(self, state: State, resumed: bool = False) -> State:
+        """Apply the edits up to the time of a state; a resumed state contains them already."""
+        if not self.edits:  # the host need not wait for the time
+            return state
+        edits = self.due(float(state.time) + 1e-3 * self.stepper.frame_dt)
+        edited = self._go_on(state, edits)
+        return state if resumed else edited
+
+    def _go_on(self, state: State, edits: Sequence[Edit]) -> State:
+        """Apply edits; the internal variable of particles that get another law starts anew."""
+        changed = self._apply_all(edits, flowed=True)
+        rest = self._pass_on(running=True)
+        if rest is None:
+            return state
+        start = rest.internal
+        if start is not None and state.internal is not None:
+            start = state.internal if changed is None else torch.where(changed, start, state.internal)
+        return state.replace(internal=start)
+
+    def _apply_all(self, edits: Sequence[Edit], flowed: bool = False) -> Tensor | None:
+        """Change the scene; returns which particles (P,) got another law, None if the material is the same."""
+        changed = [self.apply(edit, flowed) for edit in edits]
+        changed = [part for part, edit in zip(changed, edits, strict=True) if edit.of_material]
+        return torch.stack(changed).any(0) if changed else None
+
+    def _pass_on(self, running: bool = False) -> State | None:
+        """Give the material of the scene to the stepper."""
+        return self.stepper.take(dataclasses.replace(self.stepper.setup, points=self.scene.points), running)
+
+    # ---- the scene
+
+    def snapshot(self) -> tuple[MaterialPoints, nn.Parameter, nn.Parameter, int]:
+        """The scene as it is now, for :meth:`restore`."""
+        model = self.scene.model
+        return self.scene.points, model.sh0, model.shN, self.version
+
+    def restore(self, snapshot: tuple[MaterialPoints, nn.Parameter, nn.Parameter, int]) -> None:
+        """Put the scene back to what it was at a :meth:`snapshot`."""
+        self.scene.points, self.scene.model.sh0, self.scene.model.shN, self.version = snapshot
+
+    @property
+    def times(self) -> list[float]:
+        return sorted({edit.time for edit in self.edits})
+
+    def reach(self, edit: Edit) -> tuple[Tensor, Tensor]:
+        """Return masks of the particles (P,) and of the Gaussians (N,) that an edit changes."""
+        scene, region, means = self.scene, edit.region, self.scene.model.means.detach()
+        given = (scene.points.youngs_modulus, scene.points.poisson_ratio, scene.points.mass)
+        if edit.of_material and any(value.requires_grad for value in given):
+            raise ValueError(
+                "`edits` of the material would lose the gradient of `material`: leave them out, or give the material "
+                "without a gradient."
+            )
+        if region is None:
+            particles = torch.ones_like(scene.points.mass, dtype=torch.bool)
+            gaussians = torch.zeros_like(means[:, 0], dtype=torch.bool).index_fill(0, scene.moving, True)
+        else:
+            particles = region.contains(scene.frame.point_to_scene(scene.points.position).to(means.dtype))
+            gaussians = region.contains(means)
+        particles, gaussians = particles & edit.of_material, gaussians & (edit.color is not None)
+        for wanted, found, what in (
+            (edit.of_material, particles, "simulated Gaussian"),
+            (edit.color is not None, gaussians, "Gaussian"),
+        ):
+            if region is not None and wanted and not bool(found.any()):
+                between, hint = whereabouts(region, means[scene.moving], scene.frame.rotation)
+                raise ValueError(
+                    f"The region {region!r} of `edits` at {edit.time:g} s holds no {what}: those that move lie "
+                    f"{between}; {hint or 'move or enlarge it'}."
+                )
+        return particles, gaussians
+
+    def rebase(self, points: MaterialPoints) -> None:
+        """Set the material that the scene has before its edits, for :meth:`reset`."""
+        if self._loaded is not None:
+            self._loaded = (points, *self._loaded[1:])
+
+    @property
+    def unedited(self) -> tuple[MaterialPoints, Tensor, Tensor]:
+        """Material and colours (harmonics of degree 0, and of the others) without the edits."""
+        model = self.scene.model
+        return self._loaded or (self.scene.points, model.sh0.detach(), model.shN.detach())
+
+    def reset(self) -> None:
+        """Restore the scene as it was before its first edit."""
+        self.applied = 0
+        if self._loaded is None:
+            return
+        device = self.scene.model.means.device
+        points, sh0, shN = self._loaded
+        self.scene.points = points.map(lambda tensor: tensor.to(device))
+        self._paint(sh0.to(device), shN.to(device))
+        self._loaded = None
+
+    def due(self, time: float) -> list[Edit]:
+        """Return the edits up to a time [s] that were not yet applied, and mark them as applied."""
+        found = [edit for edit in self.edits[self.applied :] if edit.time <= time]
+        self.applied += len(found)
+        return found
+
+    def apply(self, edit: Edit, flowed: bool = False) -> Tensor:
+        """Apply an edit to the scene.
+
+        Args:
+            edit: The change.
+            flowed: See :func:`edited_points`.
+
+        Returns:
+            Which particles have another law now, bool, shape (P,).
+        """
+        particles, gaussians = self.reach(edit)
+        model = self.scene.model
+        if self._loaded is None:
+            self._loaded = self.unedited
+        with torch.inference_mode(False), torch.no_grad():
+            if edit.of_material:
+                self.scene.points = edited_points(self.scene.points, particles, edit, flowed)
+            if edit.color is not None:
+                sh = recolored(model.sh.detach(), gaussians, edit.color, edit.detail)
+                self._paint(sh[:, :1], sh[:, 1:])
+        return particles & (edit.law is not None)
+
+    def _paint(self, sh0: Tensor, shN: Tensor) -> None:
+        self.version += 1
+        with torch.inference_mode(False):
+            self.scene.model.sh0 = nn.Parameter(sh0.clone(), requires_grad=False)
+            self.scene.model.shN = nn.Parameter(shN.clone(), requires_grad=False)

@@ -1,15 +1,18 @@
-"""Measures the health of a run, and ends the run when it diverges."""
+"""Measurements of a frame, the health of a run, and its progress."""
 
 from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from gaussian_swaying._devices import in_double
 from gaussian_swaying._fixed import fixed
@@ -21,6 +24,7 @@ from gaussian_swaying.mpm.state import State, support_force
 from gaussian_swaying.wind.force import AirLift
 
 _PARTICLES = ("moved_particle", "compressed_particle", "stretched_particle")
+
 _SAMPLE = 4096  # particles whose nearest neighbour is searched
 
 
@@ -227,8 +231,11 @@ class Measurement:
 _OF_SCENE = tuple(
     name for name in FrameDiagnostics.__dataclass_fields__ if name not in ("time", "substeps", "cfl", "support")
 )
+
 _EXTREMES: dict[str, Callable[..., Any]] = {"J_min": min, "J_max": max, "stretch_min": min, "stretch_max": max}
+
 _EXTREMES |= {"displacement_max": max, "displacement_mean": lambda values: sum(values) / len(values)}
+
 _WHOSE = dict(zip(_PARTICLES, ("displacement_max", "stretch_min", "stretch_max"), strict=True))
 
 
@@ -385,6 +392,7 @@ def _outran(before: State, after: State) -> Tensor:
 
 
 FARTHEST = 1000  # a run ends when a particle is so many sizes of the object away from where it started
+
 _FAR, _LOST, _NOT_FINITE = 1, 2, 3  # what is wrong with a particle; the last is the worst
 
 
@@ -423,3 +431,180 @@ def _raise_if_bad(solver: Solver, verdict: list[float], time: float) -> None:
         cause = f"it is more than {FARTHEST} object sizes ({verdict[3]:.3g} m) away from where it started"
         remedy = "pin or enclose the object, or lower `solver.cfl`"
     raise SimulationDiverged(time, particle, cause, remedy)
+
+
+SOUND = (0.5, 2.0)  # range of stretch within which the object keeps its intended shape
+
+USUAL = 0.2  # largest displacement, as a fraction of the size, that still looks like wind
+
+
+def extremes(log: Sequence[Mapping[str, Any]], where: Tensor, size: float, elastic: Tensor | None) -> dict[str, Any]:
+    """Return the largest displacement, compression and stretch over the frames of a run.
+
+    Args:
+        log: Diagnostics of the frames, as from ``FrameDiagnostics.as_dict``.
+        where: Rest positions of the particles [scene units], shape (P, 3).
+        size: Longest side of the object [m].
+        elastic: Which particles are elastic, shape (P,), None for all; the stretch of plastic materials means nothing.
+
+    Returns:
+        ``moved``, ``compressed`` and ``stretched``, each a dictionary with ``value`` (in m or as a ratio of lengths),
+        ``at`` (rest position, scene units) and ``time`` [s]; ``moved`` also has its ``share`` of the size. None where
+        no frame has a value.
+    """
+    found: dict[str, Any] = {}
+    for name, field, particle, sign in (
+        ("moved", "displacement_max", "moved_particle", 1),
+        ("compressed", "stretch_min", "compressed_particle", -1),
+        ("stretched", "stretch_max", "stretched_particle", 1),
+    ):
+        told = [entry for entry in log if entry[particle] < len(where)]
+        if elastic is not None and name != "moved":
+            told = [entry for entry in told if bool(elastic.reshape(-1)[entry[particle]])]
+        if not told:
+            found[name] = None
+            continue
+        worst = max(told, key=lambda entry: sign * entry[field])
+        place = [round(float(v), 4) for v in where[worst[particle]]]
+        found[name] = {"value": worst[field], "at": place, "time": worst["time"]}
+    if found["moved"] is not None:
+        found["moved"]["share"] = found["moved"]["value"] / size
+    return found
+
+
+def advice(found: Mapping[str, Any], E: float, thickness_matters: bool = True) -> list[str]:
+    """Sentences on what went wrong with the shape of the object and what to change; none if all is well.
+
+    Args:
+        found: From :func:`extremes`.
+        E: Largest Young's modulus of the run [Pa].
+        thickness_matters: Whether ``material.thickness`` determines the volume.
+
+    Returns:
+        The sentences.
+    """
+    low, high = SOUND
+    small, large, moved = found["compressed"], found["stretched"], found["moved"]
+    bad, factor = [], 1.0
+    if small is not None and not small["value"] >= low:
+        bad.append(f"compressed to {_digits(small['value'])} of its length {_place(small)}")
+        factor = max(factor, (1 - max(small["value"], 0.0)) / (1 - low))
+    if large is not None and not large["value"] <= high:
+        bad.append(f"stretched to {_digits(large['value'])} times its length {_place(large)}")
+        factor = max(factor, (large["value"] - 1) / (high - 1))
+    if not bad:
+        return []
+    said = [f"The material was {' and '.join(bad)}; between {low:g} and {high:g} it keeps its shape."]
+    if moved is not None:
+        said.append(f"The largest displacement was {_digits(moved['value'])} m, {moved['share']:.0%} of the size, "
+                    f"{_place(moved)}.")  # fmt: skip
+    share = 0.0 if moved is None else moved["share"]
+    factor = min(max(2 * factor, share / USUAL, 3.0), 10.0)
+    stiffer = f"raise `material.E` to about {E * factor:.0e} Pa"
+    if thickness_matters:
+        stiffer += f" or `material.thickness` to {factor:.0f} times"
+    said.append(
+        f"What to change: {stiffer}; or weaken `wind.flow`; or enlarge the `region` of the pins in "
+        "`solver.boundaries`, if parts move that should stay in place."
+    )
+    return said
+
+
+def _place(entry: Mapping[str, Any]) -> str:
+    at = ", ".join(f"{value:.3g}" for value in entry["at"])
+    return f"at [{at}] (scene units, at rest) after {entry['time']:.3g} s"
+
+
+def _digits(value: float) -> str:
+    return f"{value:.2g}" if value < 100 else f"{value:.0f}"
+
+
+LONG_FRAME = 60.0  # s; a first frame that takes longer is reported
+
+MANY_TIMES = 20  # a frame with this many times the substeps of the first is reported
+
+PAUSE = 1.0  # s between two updates within a frame
+
+
+class RunProgress:
+    """A progress bar of frames that also shows the progress within a slow frame, and reports why it is slow.
+
+    Args:
+        frames: Frames of the whole run.
+        done: Frames that are already done.
+        shown: Whether to show anything.
+    """
+
+    def __init__(self, frames: int, done: int = 0, shown: bool = True) -> None:
+        self.shown = shown
+        self._bar = tqdm(total=frames, initial=min(done, frames), unit="frame", disable=not shown, file=sys.stderr)
+        self._frames, self._frame = frames, done
+        self._usual: int | None = None  # substeps of the first frame that was simulated
+        self._told = 0  # substeps of the frame that was last reported
+        self._steps = self._first = self._last = 0
+        self._began = self._looked = time.perf_counter()
+
+    def begin(self, frame: int) -> None:
+        self._frame, self._steps = frame, 0
+
+    def substep(self, done: int, steps: int) -> None:
+        now = time.perf_counter()
+        if steps != self._steps or done <= self._last:  # a new frame, or the same again with shorter substeps
+            self._began = self._looked = now
+            self._steps, self._first = steps, done
+        self._last = done
+        if now - self._looked < PAUSE:
+            return
+        self._looked = now
+        each = (now - self._began) / (done - self._first)
+        self._bar.set_postfix_str(
+            f"substep {done:,} of {steps:,}, {duration(each * (steps - done))} left in this frame"
+        )
+        self._tell(steps, each * steps)
+
+    def _tell(self, steps: int, whole: float) -> None:
+        many = self._usual is not None and steps > MANY_TIMES * self._usual
+        if not self.shown or steps < 4 * self._told or not (many or (self._usual is None and whole > LONG_FRAME)):
+            return
+        self._told = steps
+        text = f"Frame {self._frame} takes {steps:,} substeps, about {duration(whole)}"
+        if many and self._usual is not None:
+            text += (
+                f", {steps // self._usual:,} times those of the first: something stiffened or moves fast. Weaken the "
+            )
+            text += "wind or other driving forces, or raise `solver.damping`."
+        else:
+            rest = duration(whole * max(self._frames - self._frame, 1))
+            text += f", and the remaining frames about {rest}. For fewer substeps: a lower `material.E`, a higher "
+            text += "`material.density`, a coarser `solver.dx`, a longer `solver.substep`."
+        tqdm.write(f"note: {text}", file=sys.stderr)
+
+    def end(self, substeps: int, moved: float) -> None:
+        """Note that a frame is done.
+
+        Args:
+            substeps: Substeps that it took.
+            moved: Mean distance of the particles from where they were at rest [m].
+        """
+        if self._usual is None and substeps > 0:
+            self._usual = substeps
+        self._bar.update()
+        self._bar.set_postfix_str(f"{substeps:,} substeps, {moved:.3f} m from rest on average")
+
+    def close(self) -> None:
+        self._bar.close()
+
+
+def duration(seconds: float) -> str:
+    """A duration in a readable form: 12 ms, 3.4 s, 5 min, 2.1 h, 3 days.
+
+    Example:
+        >>> [duration(seconds) for seconds in (0.012, 3.4, 300, 7560, 3 * 86400)]
+        ['12 ms', '3.4 s', '5 min', '2.1 h', '3 days']
+    """
+    if not math.isfinite(seconds):
+        return "unknown"
+    for unit, size, limit in (("ms", 1e-3, 1.0), ("s", 1.0, 120.0), ("min", 60.0, 7200.0), ("h", 3600.0, 172800.0)):
+        if seconds < limit:
+            return f"{seconds / size:.2g} {unit}" if seconds / size < 10 else f"{seconds / size:.0f} {unit}"
+    return f"{seconds / 86400:,.0f} days"

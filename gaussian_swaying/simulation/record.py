@@ -21,17 +21,10 @@ from gaussian_swaying.recording.checkpoint import log_lines
 from gaussian_swaying.recording.recorder import Recorder, frame_folder
 from gaussian_swaying.rendering import passes
 from gaussian_swaying.runs import signals
-from gaussian_swaying.simulation.copies import check_recorder
-from gaussian_swaying.simulation.diagnostics import SimulationDiverged
-from gaussian_swaying.simulation.edits import SceneEditor
-from gaussian_swaying.simulation.extent import coarse, narrow
-from gaussian_swaying.simulation.frame import frames_from
-from gaussian_swaying.simulation.health import advice, extremes
-from gaussian_swaying.simulation.painter import Painter
-from gaussian_swaying.simulation.progress import RunProgress
-from gaussian_swaying.simulation.simulated_scene import SimulatedScene
-from gaussian_swaying.simulation.stepper import Stepper
-from gaussian_swaying.simulation.wind_picture import draw_vorticity, draw_wind
+from gaussian_swaying.simulation.body import SimulatedScene, coarse, narrow
+from gaussian_swaying.simulation.draw import Painter, draw_vorticity, draw_wind, frames_from
+from gaussian_swaying.simulation.measure import RunProgress, SimulationDiverged, advice, extremes
+from gaussian_swaying.simulation.step import SceneEditor, Stepper, check_recorder
 
 MAX_LOOKS = 2_000  # largest number of frames whose cameras are checked before a run
 

@@ -1,0 +1,940 @@
+"""The numbers of a simulation, those that may change, edits, and the short forms that its constructor accepts."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from gaussian_swaying._arguments import shown
+from gaussian_swaying._checks import (
+    VectorLike,
+    check_choice,
+    check_plain,
+    check_positive,
+    check_vector,
+    check_whole,
+    number_of,
+    requires_grad,
+)
+from gaussian_swaying._devices import in_double
+from gaussian_swaying._fixed import LIVE, FixedList, changed, fixed
+from gaussian_swaying._numbers import sense_of
+from gaussian_swaying.captures.capture_camera import CaptureCamera, photo_azimuth, read_views
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.harmonics import SH_DC
+from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.neighbours import particle_spacing
+from gaussian_swaying.geometry.regions import Region, RegionInFrame
+from gaussian_swaying.interop.physgaussian.camera import PhysGaussianCamera
+from gaussian_swaying.interop.physgaussian.space import CENTER, rotation_matrix
+from gaussian_swaying.mpm.boundary import Boundary
+from gaussian_swaying.mpm.contact import Contact
+from gaussian_swaying.mpm.forces import Force
+from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
+from gaussian_swaying.mpm.pins import PinnedPoints, PinnedRegion
+from gaussian_swaying.mpm.protocol import Solver
+from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.mpm.state import MaterialPoints
+from gaussian_swaying.recording.recorder import Recorder
+from gaussian_swaying.rendering.cameras.camera import azimuth_beside
+from gaussian_swaying.rendering.cameras.camera_path import CameraPath, OrbitCamera
+from gaussian_swaying.rendering.shading import Shader
+from gaussian_swaying.scenes.procedural import GivenScene, ProceduralScene
+from gaussian_swaying.simulation.body import PLATE, Material, Scene, SimulatedScene, suggest_spacing
+from gaussian_swaying.wind.computed_air import ComputedAir
+from gaussian_swaying.wind.field import SpatialWind, WindField, flow_rows
+from gaussian_swaying.wind.force import AeroForce
+from gaussian_swaying.wind.turbulence import LOOKS, look
+
+if TYPE_CHECKING:
+    from jsonargparse import Namespace
+
+M = TypeVar("M", bound=nn.Module)
+
+POLAR = ("wind.speed", "wind.azimuth", "wind.elevation")
+"""Three numbers that together are ``wind.flow``."""
+
+
+@fixed
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """Scene, material and drivers of a simulation. Never changed in place: another value makes another setup.
+
+    Attributes:
+        scene: The scene at rest.
+        material: The material that was given.
+        points: The material of the points.
+        wind: The wind.
+        aero: The force of the wind on patches.
+        forces: The custom forces.
+        solver: Numbers of the solver.
+        air: The box of computed air; None if the wind is given everywhere.
+    """
+
+    scene: SimulatedScene
+    material: Material
+    points: MaterialPoints
+    wind: WindField | SpatialWind
+    aero: AeroForce
+    forces: tuple[Force, ...]
+    solver: Any
+    air: ComputedAir | None = None
+
+
+Read = Callable[[Setup], Any]
+
+Write = Callable[[Setup, Mapping[str, Any]], Setup]
+
+
+@fixed
+@dataclass(frozen=True, eq=False)
+class Parameter:
+    """A number, or three, that may change.
+
+    Attributes:
+        name: The option of ``sim``, or a name of its own such as ``wind.speed``.
+        read: Gives its value; ValueError if a setup has none.
+        write: Gives a setup with other values of all parameters that have this function; ValueError if it has no place
+            for them.
+        unit: Its unit; empty for a pure number.
+        low: Smallest value.
+        high: Largest value.
+        scale: ``log`` for sizes of any order of magnitude, else ``linear``.
+        kind: ``number``, ``whole`` or ``vector`` (three numbers).
+        batched: Whether simulations that differ in it are steps of one rollout.
+        same_points: Whether all objects take it without other points, patches or contact.
+        differentiable: Whether it keeps the gradient of a tensor.
+    """
+
+    name: str
+    read: Read
+    write: Write
+    _: KW_ONLY
+    unit: str = ""
+    low: float = -math.inf
+    high: float = math.inf
+    scale: Literal["linear", "log"] = "linear"
+    kind: Literal["number", "whole", "vector"] = "number"
+    batched: bool = False
+    same_points: bool = True
+    differentiable: bool = False
+
+    def check(self, value: Any, name: str | None = None) -> Any:
+        """A value as plain numbers, or as the tensor that it is if a gradient is required.
+
+        Args:
+            value: A number or tensor; three of them for a vector.
+            name: Name of it in messages; its own if None.
+        """
+        name = name or self.name
+        if requires_grad(value) and not self.differentiable:
+            raise ValueError(f"`{name}` would lose its gradient: give a plain number (`tensor.detach()`).")
+        if self.kind == "vector":
+            plain = check_vector(name, value.detach() if isinstance(value, Tensor) else value)
+            return value if isinstance(value, Tensor) and value.requires_grad else list(plain)
+        if isinstance(value, bool) or not isinstance(value, int | float | Tensor):
+            raise TypeError(f"Expected `{name}` to be a number, but got {value!r:.60}.")
+        if self.kind == "whole" and value != int(value):
+            raise TypeError(f"Expected `{name}` to be a whole number, but got {value!r:.60}.")
+        plain_number = float(number_of(value))
+        if not self.low <= plain_number <= self.high or not math.isfinite(plain_number):
+            raise ValueError(f"Expected `{name}` to be {self.range_in_words}, but got {plain_number:g}.")
+        if isinstance(value, Tensor) and value.requires_grad:
+            return value
+        return int(plain_number) if self.kind == "whole" else plain_number
+
+    @property
+    def range_in_words(self) -> str:
+        if self.low == -math.inf:
+            return "finite"
+        return f"at least {self.low:g}" if self.high == math.inf else f"from {self.low:g} to {self.high:g}"
+
+
+_KNOWN: dict[str, Parameter] = {}
+
+
+def register(name: str, read: Read | None = None, *, write: Write | None = None, **settings: Any) -> Parameter:
+    """Add a parameter.
+
+    Args:
+        name: ``forces.CLASS.ATTRIBUTE`` for a number of a force of that class; any other name needs ``read`` and
+            ``write``.
+        read: Gives its value; found by the name for a force.
+        write: Changes it; found by the name for a force.
+        settings: Further attributes of :class:`Parameter`: unit, range, scale, kind, and how it may be used.
+
+    Returns:
+        The parameter.
+
+    Raises:
+        ValueError: If the name is taken, or says nothing about how to change it.
+    """
+    if name in _KNOWN:
+        raise ValueError(f"The parameter `{name}` is registered already: choose another name.")
+    parts = name.split(".")
+    if read is None and write is None and parts[0] == "forces" and len(parts) == 3:
+        read, write = _of_force(parts[1], parts[2])
+    if read is None or write is None:
+        raise ValueError(f"Expected `{name}` to be forces.CLASS.ATTRIBUTE, or to come with `read` and `write`.")
+    sense = sense_of(name)
+    _KNOWN[name] = Parameter(name, read, write, **((sense._asdict() if sense else {}) | settings))
+    LIVE.add(name)
+    return _KNOWN[name]
+
+
+def names() -> list[str]:
+    """The names of all parameters; ``*`` stands for the place of a modulation."""
+    return list(_KNOWN)
+
+
+def find(name: str) -> Parameter | None:
+    """The parameter of a name, or None. ``wind.modulations.0.FIELD`` is any number of a modulation of the wind."""
+    if name in _KNOWN:
+        return _KNOWN[name]
+    parts = name.split(".")
+    if parts[:2] == ["wind", "modulations"] and len(parts) == 4 and parts[2].isdecimal():
+        like = _KNOWN.get(f"wind.modulations.*.{parts[3]}", _KNOWN["wind.modulations.*.amplitude"])
+        known = like.name.endswith(f".{parts[3]}")
+        more: dict[str, Any] = {} if known else {"unit": "", "low": -math.inf, "high": math.inf, "scale": "linear"}
+        return replace(like, name=name, read=_of_modulation(name), **more)
+    return None
+
+
+def parameter(name: str) -> Parameter:
+    """As :func:`find`."""
+    found = find(name)
+    if found is None:
+        raise ValueError(f"`{name}` is no parameter that may change: use one of {', '.join(names())}.")
+    return found
+
+
+def present(setup: Setup, start: str = "") -> list[str]:
+    """The names of the parameters of a setup that begin with a prefix."""
+    found = []
+    for name in names():
+        if name.startswith(start) and "*" not in name:
+            try:
+                parameter(name).read(setup)
+            except ValueError:
+                continue
+            found.append(name)
+    return found
+
+
+def value_of(setup: Setup, name: str) -> Any:
+    """The value of a parameter in a setup."""
+    return parameter(name).read(setup)
+
+
+def with_values(setup: Setup, values: Mapping[str, Any]) -> Setup:
+    """A setup with other values.
+
+    Args:
+        setup: The setup, which stays as it is.
+        values: Values by the names of parameters; tensors keep their gradient where the parameter is differentiable.
+    """
+    together: dict[Write, dict[str, Any]] = {}
+    for name, value in values.items():
+        known = parameter(name)
+        together.setdefault(known.write, {})[name] = known.check(value)
+    for write, several in together.items():
+        setup = write(setup, several)
+    return setup
+
+
+def in_settings(settings: Namespace, name: str, value: Any) -> None:
+    """Set a parameter in parsed settings, which are changed.
+
+    Args:
+        settings: From the parser of a simulation.
+        name: The parameter.
+        value: Its value.
+    """
+    value, parts = parameter(name).check(value), name.split(".")
+    if name in POLAR:
+        settings.wind.flow = flow_of(list(settings.wind.flow), {name: value})
+    elif parts[0] == "forces":
+        _arguments(settings.forces, parts[1], name)[parts[2]] = value
+    elif parts[:2] == ["wind", "modulations"]:
+        entries = settings.wind.modulations
+        if int(parts[2]) >= len(entries):
+            raise ValueError(f"The wind has no modulation {parts[2]} for `{name}`: add it to `wind.modulations`.")
+        _arguments([entries[int(parts[2])]], "", name)[parts[3]] = value
+    else:
+        settings[name] = value
+        if name == "wind.flow":
+            settings.wind.schedule = None
+
+
+def all_in_settings(settings: Namespace, values: Mapping[str, Any]) -> None:
+    """Set several parameters as :func:`in_settings` does; the speed of the wind first, as still air has no angles."""
+    for name in sorted(values, key=lambda name: name != POLAR[0]):
+        in_settings(settings, name, values[name])
+
+
+def of_settings(settings: Namespace, name: str) -> Any:
+    """The value of a parameter in parsed settings, as :func:`in_settings` sets it."""
+    parts = name.split(".")
+    if name in POLAR:
+        return angles_of(settings.wind.flow)[POLAR.index(name)]
+    if parts[0] == "forces":
+        return _arguments(settings.forces, parts[1], name)[parts[2]]
+    if parts[:2] == ["wind", "modulations"]:
+        return settings.wind.modulations[int(parts[2])]["init_args"][parts[3]]
+    return settings[name]
+
+
+def _arguments(entries: Sequence[Any], kind: str, name: str) -> Any:
+    """The ``init_args`` of the first entry of a class; of any class if ``kind`` is empty."""
+    for entry in entries or ():
+        if not kind or entry["class_path"].rsplit(".", 1)[-1] == kind:
+            if entry.get("init_args") is None:
+                entry["init_args"] = {}
+            return entry["init_args"]
+    raise ValueError(f"`forces` has no {kind} for `{name}`: add it.")
+
+
+def flow_of(base: Sequence[float], values: Mapping[str, float]) -> list[float]:
+    """A flow [m/s] with some of ``wind.speed``, ``wind.azimuth`` and ``wind.elevation`` replaced.
+
+    Example:
+        >>> [round(x, 3) for x in flow_of([2.0, 0.0, 0.0], {"wind.azimuth": 90.0})]
+        [0.0, 2.0, 0.0]
+    """
+    x, y, z = base
+    speed = values.get("wind.speed", math.hypot(x, y, z))
+    azimuth = math.radians(values["wind.azimuth"]) if "wind.azimuth" in values else math.atan2(y, x)
+    rise = math.radians(values["wind.elevation"]) if "wind.elevation" in values else math.atan2(z, math.hypot(x, y))
+    level = speed * math.cos(rise)
+    return [level * math.cos(azimuth), level * math.sin(azimuth), speed * math.sin(rise)]
+
+
+# ---- how they are set
+def _uniform_wind(setup: Setup) -> WindField:
+    if not isinstance(setup.wind, WindField):
+        raise ValueError("Expected `wind` to be a WindField: a custom wind has no numbers that could be changed.")
+    return setup.wind
+
+
+def _steady(setup: Setup, name: str) -> WindField:
+    wind = _uniform_wind(setup)
+    if len(wind.flows) > 1:
+        raise ValueError(f"`wind.schedule` gives the flow: remove it, or do not change `{name}`.")
+    return wind
+
+
+def _write_polar(setup: Setup, values: Mapping[str, Any]) -> Setup:
+    wind = _steady(setup, next(iter(values)))
+    base = wind.flows[0].tolist()
+    if not any(base) and len(values) < 2:
+        raise ValueError("The base has no `wind.flow`: give one, or seek `wind.speed` and `wind.azimuth`.")
+    return replace(setup, wind=wind.with_flow(flow_of(base, values)))
+
+
+def _write_wind(setup: Setup, values: Mapping[str, Any]) -> Setup:
+    wind = _uniform_wind(setup)
+    if "wind.flow" in values:
+        wind = wind.with_flow(values["wind.flow"])
+    if "wind.seed" in values:
+        wind = changed(wind, seed=values["wind.seed"])
+    return replace(setup, wind=wind)
+
+
+def _write_modulation(setup: Setup, values: Mapping[str, Any]) -> Setup:
+    wind = _uniform_wind(setup)
+    parts = list(wind.modulations)
+    for name, value in values.items():
+        _of_modulation(name)(setup)  # it is there
+        _, _, place, field = name.split(".")
+        parts[int(place)] = changed(parts[int(place)], **{field: value})
+    return replace(setup, wind=changed(wind, modulations=FixedList(parts)))
+
+
+def _of_modulation(name: str) -> Read:
+    def read(setup: Setup) -> float:
+        wind = _uniform_wind(setup)
+        place, field = int(name.split(".")[2]), name.split(".")[3]
+        there = wind.modulations[place] if place < len(wind.modulations) else None
+        value = getattr(there, field, None)
+        if not isinstance(value, float):
+            raise ValueError(f"The wind has no number `{name}`: add the modulation.")
+        return value
+
+    return read
+
+
+def _polar(setup: Setup) -> tuple[float, float, float]:
+    return angles_of(_steady(setup, POLAR[0]).flows[0].tolist())
+
+
+def angles_of(flow: Sequence[float]) -> tuple[float, float, float]:
+    """Speed [m/s], azimuth from x towards y and elevation [degrees] of a flow."""
+    x, y, z = flow
+    return math.hypot(x, y, z), math.degrees(math.atan2(y, x)), math.degrees(math.atan2(z, math.hypot(x, y)))
+
+
+def _write_material(setup: Setup, values: Mapping[str, Any]) -> Setup:
+    points, material = setup.points, setup.material
+
+    for name in values:
+        if any(getattr(part, name[9:]) is not None for part in material.regions):
+            raise ValueError(
+                f"`{name}` is to change, but `material.regions` or `scene.parts` gives it too: remove it there."
+            )
+    bends = material.bending is not None or any(part.bending is not None for part in material.regions)
+    if bends and setup.points.bending is None:
+        for name in ("material.E", "material.nu"):
+            if name in values:
+                raise ValueError(
+                    f"`{name}` is to change, but with `material.bending` it says where the layers lie: make another "
+                    "simulation, or leave `material.bending` out."
+                )
+    if "material.thickness" in values:
+        ratio = values["material.thickness"] / _thickness(setup)
+        points = thicker(setup, ratio).points
+        material = replace(material, thickness=values["material.thickness"])
+    if points.bending is not None and setup.material.bending == PLATE:
+        points = replace(points, bending=points.bending * _stiffer(setup, values))
+    for name, own in (("E", "youngs_modulus"), ("nu", "poisson_ratio")):
+        if f"material.{name}" in values:
+            value = values[f"material.{name}"]
+            # a sum keeps a gradient
+            points = replace(points, **{own: torch.zeros_like(getattr(points, own)) + value})
+            material = replace(material, **{name: value})
+    if "material.density" in values:
+        points = replace(points, mass=points.volume * values["material.density"])
+        material = replace(material, density=values["material.density"])
+    return replace(setup, points=points, material=material)
+
+
+def _stiffer(setup: Setup, values: Mapping[str, Any]) -> Any:
+    """Factor of the stiffness against bending of each point of a plate of one layer, by Kirchhoff's D."""
+    points, ratio = setup.points, 1.0
+    if "material.E" in values:
+        ratio = ratio * values["material.E"] / points.youngs_modulus
+    if "material.nu" in values:
+        ratio = ratio * (1 - points.poisson_ratio.square()) / (1 - values["material.nu"] ** 2)
+    if "material.thickness" in values:
+        ratio = ratio * (values["material.thickness"] / _thickness(setup)) ** 3
+    return ratio
+
+
+def thicker(setup: Setup, ratio: Any) -> Setup:
+    """A setup whose points have so many times the mass and volume, as in a sheet of so many times the thickness."""
+    points = setup.points
+    return replace(setup, points=replace(points, mass=points.mass * ratio, volume=points.volume * ratio))
+
+
+def _thickness(setup: Setup) -> float:
+    """The thickness; ValueError unless the object is a sheet of one layer, whose points stay if it gets thicker."""
+    scene, material = setup.scene, setup.material
+    if material.volume != "patch" or scene.filled or setup.points.count != scene.on_surface + scene.filled:
+        raise ValueError(
+            "`material.thickness` can be changed only of a sheet of one layer (`scene.layers: 1`): change `material.E` "
+            "and `material.density` instead."
+        )
+    return number_of(material.thickness)
+
+
+def _write_aero(setup: Setup, values: Mapping[str, Any]) -> Setup:
+    return replace(setup, aero=changed(setup.aero, **{name[5:]: value for name, value in values.items()}))
+
+
+def _of_aero(name: str) -> Read:
+    return lambda setup: number_of(getattr(setup.aero, name))
+
+
+def _of_solver(name: str) -> Read:
+    def read(setup: Setup) -> Any:
+        if not hasattr(setup.solver, name):
+            raise ValueError(f"This solver has no `{name}`.")
+        return getattr(setup.solver, name)
+
+    return read
+
+
+def _write_solver(setup: Setup, values: Mapping[str, Any]) -> Setup:
+    changes: dict[str, Any] = {name[7:]: value for name, value in values.items()}
+    if "gravity" in changes:
+        changes["gravity"] = tuple(changes["gravity"])
+    return replace(setup, solver=replace(setup.solver, **changes))
+
+
+def _of_force(kind: str, attribute: str) -> tuple[Read, Write]:
+    def read(setup: Setup) -> float:
+        for force in setup.forces:
+            if type(force).__name__ == kind:
+                return number_of(getattr(force, attribute))
+        raise ValueError(f"There is no force {kind}: add it to `forces`.")
+
+    def write(setup: Setup, values: Mapping[str, Any]) -> Setup:
+        read(setup)
+        (value,) = values.values()
+        forces = tuple(changed(f, **{attribute: value}) if type(f).__name__ == kind else f for f in setup.forces)
+        return replace(setup, forces=forces)
+
+    return read, write
+
+
+def _mean(field: str) -> Read:
+    return lambda setup: float(in_double(getattr(setup.points, field).detach()).mean())
+
+
+def _steady_flow(setup: Setup) -> list[float]:
+    flow: list[float] = _steady(setup, "wind.flow").flows[0].tolist()
+    return flow
+
+
+def _density(setup: Setup) -> float:
+    return float((in_double(setup.points.mass).sum() / in_double(setup.points.volume).sum()).detach())
+
+
+_SIZE: dict[str, Any] = {"scale": "log"}
+
+_MATERIAL: dict[str, Any] = {"batched": True, "differentiable": True}
+
+register("wind.flow", _steady_flow, write=_write_wind, kind="vector", batched=True, differentiable=True)
+
+register("wind.seed", lambda setup: _uniform_wind(setup).seed, write=_write_wind, kind="whole", batched=True)
+
+register("wind.speed", lambda setup: _polar(setup)[0], write=_write_polar, batched=True, **_SIZE)
+
+register("wind.azimuth", lambda setup: _polar(setup)[1], write=_write_polar, batched=True)
+
+register("wind.elevation", lambda setup: _polar(setup)[2], write=_write_polar, batched=True)
+
+for _name in ("amplitude", "delta", "std", "period", "interval", "phase"):
+    _reader, _rest = _of_modulation(f"wind.modulations.0.{_name}"), {} if _name == "phase" else _SIZE
+    register(f"wind.modulations.*.{_name}", _reader, write=_write_modulation, batched=True, **_rest)
+
+register("material.E", _mean("youngs_modulus"), write=_write_material, **_SIZE, **_MATERIAL)
+
+register("material.nu", _mean("poisson_ratio"), write=_write_material, **_MATERIAL)
+
+register("material.density", _density, write=_write_material, **_SIZE, **_MATERIAL)
+
+register("material.thickness", _thickness, write=_write_material, batched=True, same_points=False, **_SIZE)
+
+for _name in ("C_D", "C_F", "C_L"):
+    register(f"aero.{_name}", _of_aero(_name), write=_write_aero, differentiable=True, **_SIZE)
+
+register("aero.added_mass", _of_aero("added_mass"), write=_write_aero, **_SIZE)
+
+register("solver.gravity", lambda setup: list(_of_solver("gravity")(setup)), write=_write_solver, kind="vector")
+
+for _name in ("damping", "stiffness_damping"):
+    register(f"solver.{_name}", _of_solver(_name), write=_write_solver, **_SIZE)
+
+
+LUMINANCE = (0.2126, 0.7152, 0.0722)  # ITU-R BT.709
+
+
+@fixed
+@dataclass
+class Edit:
+    """A change to a part of the object.
+
+    Deformations and velocities stay as they are; stresses follow the new material from then on. Where the law changes,
+    its internal variable is reset. The thickness cannot be edited: the points of the material, their layers and the
+    contact samples depend on it.
+
+    Args:
+        region: Region at rest, in scene units; it may also contain Gaussians that do not move. Everything that moves if
+            null.
+        time: Time [s]: the edit applies from the first frame at or after it. 0 means at load.
+        E: Young's modulus [Pa]; unchanged if null.
+        nu: Poisson's ratio; unchanged if null.
+        density: Density at rest [kg/m³]; unchanged if null.
+        law: Constitutive law; unchanged if null. A plastic law needs ``solver.formulation: updated``.
+        color: Red, green and blue in [0, 1], the same from every direction; unchanged if null.
+        detail: Fraction of the brightness differences within the region that the new colour keeps, in [0, 1].
+    """
+
+    region: Region | None = None
+    time: float = 0.0
+    _: KW_ONLY
+    E: float | None = None
+    nu: float | None = None
+    density: float | None = None
+    law: ConstitutiveLaw | None = None
+    color: list[float] | None = None
+    detail: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_positive("edits.time", self.time, allow_zero=True)
+        for name in ("E", "nu", "density"):
+            if getattr(self, name) is not None:
+                check_plain(f"edits.{name}", getattr(self, name))
+                parameter(f"material.{name}").check(getattr(self, name), f"edits.{name}")
+        if self.color is not None and not all(0 <= part <= 1 for part in check_vector("edits.color", self.color)):
+            raise ValueError(f"Expected `edits.color` to lie in [0, 1], but got {self.color}.")
+        if not 0 <= self.detail <= 1:
+            raise ValueError(f"Expected `edits.detail` to lie in [0, 1], but got {self.detail}.")
+        if not self.of_material and self.color is None:
+            raise ValueError("An entry of `edits` changes nothing: give `E`, `nu`, `density`, `law` or `color`.")
+
+    @property
+    def of_material(self) -> bool:
+        """True if more than the colour changes."""
+        return any(value is not None for value in (self.E, self.nu, self.density, self.law))
+
+
+def edited_points(points: MaterialPoints, inside: Tensor, edit: Edit, flowed: bool = False) -> MaterialPoints:
+    """Apply an edit to the material.
+
+    Args:
+        points: The material of one scene, shapes (P, ·).
+        inside: Which points are edited, bool, shape (P,).
+        edit: The change.
+        flowed: Whether the points have already moved. After plastic flow, the elastic and the total deformation differ
+            for good. If no plastic law is left, one of the other laws is set to keep both, and the plastic law stays in
+            the list without particles, because the kernels check the list.
+
+    Returns:
+        The material; laws that no point uses any more are left out.
+    """
+
+    def field(value: float | None, old: Tensor) -> Tensor:
+        return old if value is None else torch.where(inside, value, old)
+
+    before = torch.zeros_like(inside, dtype=torch.long) if points.law_index is None else points.law_index
+    index, laws = before, list(points.laws)
+    if edit.law is not None:
+        index = torch.where(inside, len(laws), before)
+        laws.append(edit.law)
+    used = torch.unique(index).tolist()
+    kept = [laws[k] for k in used]
+    had_both = flowed and any(laws[k].plastic for k in torch.unique(before).tolist())
+    if had_both and not any(type(law).plastic for law in kept):
+        kept[0] = copy.deepcopy(kept[0])
+        kept[0].plastic = True
+        kept.append(next(law for law in laws if type(law).plastic))
+    place = torch.zeros(len(laws), dtype=torch.long, device=index.device)
+    place[used] = torch.arange(len(used), device=index.device)
+    bending = points.bending
+    if bending is not None and edit.E is not None:
+        bending = torch.where(inside, bending * edit.E / points.youngs_modulus, bending)
+    mass = points.mass if edit.density is None else torch.where(inside, edit.density * points.volume, points.mass)
+    return dataclasses.replace(
+        points,
+        mass=mass,
+        youngs_modulus=field(edit.E, points.youngs_modulus),
+        bending=bending,
+        poisson_ratio=field(edit.nu, points.poisson_ratio),
+        laws=tuple(kept),
+        law_index=place[index] if len(kept) > 1 else None,
+    )
+
+
+def recolored(sh: Tensor, inside: Tensor, color: Sequence[float], detail: float = 0.0) -> Tensor:
+    """Spherical harmonics of a splat, with one colour for a part of it.
+
+    Args:
+        sh: Coefficients, shape (N, K, 3).
+        inside: Which Gaussians get the colour, bool, shape (N,).
+        color: Red, green and blue in [0, 1].
+        detail: Fraction of the brightness differences that is kept: the colour is multiplied by ``1 + detail (Y /
+            mean(Y) - 1)`` with the luminance Y of the old colours.
+
+    Returns:
+        Shape (N, K, 3).
+    """
+    old = (sh[:, 0] * SH_DC + 0.5).clamp_min(0)
+    luminance = (old * old.new_tensor(LUMINANCE)).sum(-1)
+    mean = torch.where(inside, luminance, 0.0).sum() / inside.sum().clamp_min(1)
+    factor = 1 + detail * (luminance / mean.clamp_min(1e-6) - 1)
+    new = torch.zeros_like(sh)
+    new[:, 0] = (factor[:, None] * old.new_tensor(list(color)) - 0.5) / SH_DC
+    return torch.where(inside[:, None, None], new, sh)
+
+
+@fixed
+@dataclass
+class Copy:
+    """One of several copies of the object. Without values it is the object itself, at its own place.
+
+    Args:
+        shift: Where it stands, from the place of the object [m]: z up, along the axes of the wind.
+        turn: Angle about the vertical, counterclockwise from above [degrees]. The axis goes through the middle of what
+            the pins hold, such as the foot of a plant; through the middle of the object if nothing is held.
+        delay: Time by which the wind and its gusts come later than for the object [s].
+        seed: Seed of its gusts. Null for gusts of its own, with the seed of the wind plus the number of the copy (from
+            0 on); or with a ``delay`` for those of the wind, only later.
+    """
+
+    shift: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    turn: float = 0.0
+    _: KW_ONLY
+    delay: float = 0.0
+    seed: int | None = None
+
+    def __post_init__(self) -> None:
+        self.shift = list(check_vector("copies.shift", self.shift))
+        for name in ("turn", "delay"):
+            check_vector(f"copies.{name}", [getattr(self, name)], 1)
+        if self.seed is not None:
+            check_whole("copies.seed", self.seed, 0)
+
+
+@fixed
+@dataclass
+class Normalisation:
+    """PhysGaussian's normalised space. With it, boundaries and regions of the material are given in this space.
+
+    The scene is rotated, and the simulated part scaled and centred at (1, 1, 1). The region of the scene is given in
+    turned axes, but in scene units. The unit of the normalised space is a metre.
+
+    Args:
+        rotation_degree: Angles of successive rotations of the scene [degrees].
+        rotation_axis: Axis of each: 0, 1 or 2 for x, y or z.
+        scale: Longest side of the simulated part along the turned axes [m].
+    """
+
+    rotation_degree: list[float] = field(default_factory=list)
+    rotation_axis: list[int] = field(default_factory=list)
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_positive("normalisation.scale", self.scale)
+        rotation_matrix(self.rotation_degree, self.rotation_axis)
+
+    @property
+    def rotation(self) -> Tensor:
+        """Scene axes to turned axes, shape (3, 3), float64."""
+        return rotation_matrix(self.rotation_degree, self.rotation_axis)
+
+    def fit(self, points: Tensor) -> SimFrame:
+        """The map from the normalised space to a scene.
+
+        Args:
+            points: Points of the simulated part in scene units, shape (N, 3).
+
+        Returns:
+            A frame whose ``point_to_sim`` takes points of the normalised space to scene units, and whose
+            ``point_to_scene`` takes them back.
+
+        Raises:
+            ValueError: If the points have no extent.
+        """
+        rotation = self.rotation
+        turned = points.detach().cpu().double() @ rotation.T
+        low, high = turned.amin(0), turned.amax(0)
+        extent = float((high - low).amax())
+        if extent <= 0:
+            raise ValueError("The simulated part has no extent for `normalisation` to scale.")
+        scale = self.scale / extent
+        origin = torch.tensor(CENTER, dtype=torch.float64) - scale * 0.5 * (low + high)
+        return SimFrame(origin, rotation.T.contiguous(), 1 / scale)
+
+    def place(
+        self,
+        scene: Scene,
+        material: Material,
+        solver: Solver,
+        camera: CameraPath | None = None,
+        cameras: Mapping[str, CameraPath] | None = None,
+        edits: Sequence[Edit] = (),
+        cloud: GaussianCloud | None = None,
+    ) -> tuple[Scene, Material, Solver, CameraPath | None, dict[str, CameraPath], list[Edit]]:
+        """Components in scene units, from those in the normalised space, which stay as they are.
+
+        Args:
+            scene: Its region is in turned axes.
+            material: Its regions are in the normalised space.
+            solver: Its boundaries are in the normalised space.
+            camera: A :class:`PhysGaussianCamera` is in the normalised space; other cameras are in scene units.
+            cameras: Further cameras, likewise.
+            edits: Their regions are in the normalised space.
+            cloud: The Gaussians of the scene, if they have been read already.
+
+        Returns:
+            Copies of the first six arguments, the scene with ``metres_per_unit`` set.
+        """
+        if scene.longest_side is not None or scene.metres_per_unit is not None:
+            raise ValueError(
+                "`normalisation` sets the scale of the scene: remove `scene.longest_side` and "
+                "`scene.metres_per_unit`, or `normalisation`."
+            )
+        turned = SimFrame(torch.zeros(3, dtype=torch.float64), self.rotation.T.contiguous(), 1.0)
+        scene = changed(scene, region=RegionInFrame(scene.region, turned))
+        cloud = scene.cloud() if cloud is None else cloud
+        frame = self.fit(cloud.means[scene.select(cloud)])
+        scene = changed(scene, metres_per_unit=1 / frame.metres_per_unit)
+        regions = [dataclasses.replace(e, region=RegionInFrame(e.region, frame)) for e in material.regions]
+        conditions = [b.in_frame(frame) for b in solver.boundaries if isinstance(b, Boundary)]
+        solver = changed(solver, boundaries=FixedList(conditions))
+        material, first = dataclasses.replace(material, regions=regions), camera and _seen(camera, frame)
+        further = {name: _seen(path, frame) for name, path in (cameras or {}).items()}
+        changes = [dataclasses.replace(e, region=e.region and RegionInFrame(e.region, frame)) for e in edits]
+        return scene, material, solver, first, further, changes
+
+
+def _seen(camera: CameraPath, frame: SimFrame) -> CameraPath:
+    """A camera path in scene units."""
+    return changed(camera, frame=frame) if isinstance(camera, PhysGaussianCamera) else camera
+
+
+if TYPE_CHECKING:
+    SceneLike = Scene | ProceduralScene | GaussianCloud | str | os.PathLike[str]
+    WindLike = WindField | SpatialWind | VectorLike | str
+    DeviceLike = torch.device | str
+    SolverLike = Solver
+    MaterialLike = Material | str
+else:  # what a YAML file can contain: the annotations of the constructor are its schema
+    SceneLike, WindLike, DeviceLike = Scene, WindField, Literal["auto", "cpu", "cuda"]
+    SolverLike, MaterialLike = MPMSolver, Material
+
+HoldLike = Region | PinnedRegion | PinnedPoints | list[Region | PinnedRegion | PinnedPoints]
+
+CELLS = 32
+"""Largest number of grid cells along the longest side if no solver is given."""
+
+
+def resolve_device(device: DeviceLike) -> torch.device:
+    """The device of a name: ``auto`` (a CUDA GPU if there is one, else the CPU), ``cpu`` or ``cuda``."""
+    if isinstance(device, torch.device):
+        return device
+    if device != "auto" and not device.startswith("cuda"):
+        return torch.device(device)
+    if torch.cuda.is_available():
+        return torch.device("cuda" if device == "auto" else device)
+    if device != "auto":
+        raise ValueError(
+            "`--device cuda` needs a CUDA GPU and a CUDA build of torch, but found none: use --device auto or cpu."
+        )
+    return torch.device("cpu")
+
+
+def as_scene(source: SceneLike, up: Sequence[float] | None = None) -> Scene:
+    """Make a scene from settings, a file, Gaussians or a scene made in code.
+
+    Args:
+        source: The object to simulate.
+        up: Direction that points up in it; z if None.
+
+    Returns:
+        A :class:`Scene` as it is. Anything else is simulated as a whole.
+    """
+    if isinstance(source, Scene):
+        if up is not None:
+            raise ValueError("`up` belongs to the scene: write Scene(..., up=...), and leave out the separate `up`.")
+        return source
+    direction = [0.0, 0.0, 1.0] if up is None else list(check_vector("up", up))
+    if isinstance(source, ProceduralScene | GaussianCloud):
+        generator = GivenScene(source) if isinstance(source, GaussianCloud) else source
+        return Scene(generator=generator, up=direction)
+    return Scene(ply=source, up=direction)
+
+
+def as_material(material: MaterialLike | None) -> Material:
+    """Return the given material, that of a name, or the default."""
+    return Material.named(material) if isinstance(material, str) else material or Material()
+
+
+def as_solver(
+    solver: Solver | None, hold: HoldLike | None, scene: Scene, cloud: GaussianCloud, damping: float = 0.0
+) -> Solver:
+    """Return a copy of the given solver, which may be another simulation's, or make one that suits the scene.
+
+    An object that ``hold`` or a part of the scene holds then has no gravity, as in the starters of the preview: its
+    captured shape is already in balance with its weight. ``damping`` [1/s] is that of a solver that is made.
+    """
+    if solver is None:
+        given = list(hold) if isinstance(hold, list | tuple) else [] if hold is None else [hold]
+        pins = [PinnedRegion(part) if isinstance(part, Region) else part for part in given]
+        means = cloud.means[scene.select(cloud)]
+        frame = SimFrame.fit(means, scene.up, scene.longest_side, scene.metres_per_unit)
+        side = float((means.amax(0) - means.amin(0)).amax()) * frame.metres_per_unit
+        spacing = particle_spacing(means) * frame.metres_per_unit
+        held = bool(pins) or (scene.parts is not None and bool(scene.parts.mask(role="held").any()))
+        gravity = (0.0, 0.0, 0.0 if held else -9.8)
+        return MPMSolver(dx=suggest_spacing(side, spacing, CELLS), gravity=gravity, boundaries=pins, damping=damping)
+    if hold is not None:
+        raise ValueError(
+            "`hold` only works without a solver: add the pin to the `boundaries` of the solver, and leave out `hold`."
+        )
+    return changed(solver, boundaries=FixedList(map(changed, solver.boundaries)))
+
+
+def as_wind(wind: WindLike | None, frame: SimFrame) -> WindField | SpatialWind:
+    """Return the given wind, a look by its name, a steady wind from three numbers [m/s], or still air for None.
+
+    Places of its effects are converted from scene units to metres.
+    """
+    if isinstance(wind, WindField):
+        return wind.in_frame(frame)
+    if isinstance(wind, SpatialWind):
+        return wind
+    if isinstance(wind, str):
+        check_choice("wind", wind, tuple(LOOKS))
+        return look(wind).in_frame(frame)
+    return WindField() if wind is None else WindField(flow_rows("wind", [wind])[0])
+
+
+def as_camera(
+    camera: CameraPath | None,
+    cameras: Mapping[str, CameraPath] | None,
+    wind: WindField | SpatialWind,
+    scene: SimulatedScene,
+) -> CameraPath:
+    """Return the given camera, or an orbit camera that looks at the front of the object or from beside the wind.
+
+    The front is the side from which photos were taken; they are known if one of ``cameras`` is that of a capture.
+    Beside a wind, its strongest flow goes to the right of the picture. If photos are from all around, and the wind is
+    not horizontal or differs from place to place, the azimuth is that of an :class:`OrbitCamera` by default.
+    """
+    if camera is not None:
+        return camera
+    captured = next((path for path in (cameras or {}).values() if isinstance(path, CaptureCamera)), None)
+    azimuth = None
+    if captured is not None:
+        eyes = torch.stack([seen.position for _, seen in read_views(captured.path, origin=scene.model.origin)])
+        azimuth = photo_azimuth(eyes, scene.center.cpu(), scene.frame.rotation)
+    if azimuth is None and isinstance(wind, WindField):
+        azimuth = azimuth_beside(wind.flows[int(wind.flows.norm(dim=-1).argmax())].tolist())
+    return OrbitCamera() if azimuth is None else OrbitCamera(azimuth=azimuth)
+
+
+def check_types(given: Mapping[str, Any]) -> None:
+    """Raise TypeError if an argument is not of its kind; None is accepted.
+
+    Args:
+        given: Arguments of a simulation by their names.
+    """
+    for name, value in given.items():
+        if name in _KINDS and value is not None and not isinstance(value, _KINDS[name]):
+            words = " or ".join(kind.__name__ for kind in _KINDS[name])
+            raise TypeError(f"Expected `{name}` to be a {words}, but got {shown(value)}.")
+        for part in value if name in _LISTS and isinstance(value, list | tuple) else ():
+            if not isinstance(part, _LISTS[name]) and not (name == "forces" and callable(part)):
+                words = " or ".join(kind.__name__ for kind in _LISTS[name])
+                raise TypeError(f"Expected `{name}` to be a list of {words}, but it has {shown(part)}.")
+
+
+_KINDS: dict[str, tuple[type, ...]] = {
+    "scene": (Scene, ProceduralScene, GaussianCloud, str, os.PathLike),
+    "material": (Material, str),
+    "solver": (Solver,),
+    "cloud": (GaussianCloud,),
+    "contact": (Contact,),
+    "aero": (AeroForce,),
+    "forces": (list, tuple),
+    "shader": (Shader,),
+    "camera": (CameraPath,),
+    "cameras": (Mapping,),
+    "edits": (list, tuple),
+    "copies": (list, tuple),
+    "recorder": (Recorder,),
+    "normalisation": (Normalisation,),
+    "hold": (Region, PinnedRegion, PinnedPoints, list, tuple),
+}
+
+_LISTS = {"forces": (Force,), "edits": (Edit,), "copies": (Copy,), "hold": (Region, PinnedRegion, PinnedPoints)}
