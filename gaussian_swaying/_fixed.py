@@ -1,6 +1,7 @@
 """Settings stay as they were made, so that the record of a run says what ran: assigning to them is an error.
 
-A class of the package refuses every public name; one of a user's own those that it has from the package.
+A class of the package refuses every public name; one of a user's own those that it has from the package. What may
+change is counted (:func:`version`), so that a recording knows whether it is still valid.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import inspect
 from collections.abc import Callable
 from dataclasses import is_dataclass
 from functools import wraps
+from itertools import count
 from typing import Any, NoReturn, TypeVar
 
 import torch
@@ -20,6 +22,19 @@ from gaussian_swaying._arguments import check_arguments
 T = TypeVar("T")
 LIVE: set[str] = set()
 """Names of the numbers that ``Simulation.change`` changes."""
+_changes = count()
+_version = next(_changes)
+
+
+def version() -> int:
+    """A number that is another one after any change of a setting that was made; tensors can change without."""
+    return _version
+
+
+def count_change() -> None:
+    """Give :func:`version` another value."""
+    global _version
+    _version = next(_changes)
 
 
 class Fixed:
@@ -51,6 +66,9 @@ class Fixed:
 
     def __setattr__(self, name: str, value: Any) -> None:
         _check(self, name, value)
+        counts = "_made" in vars(self) and name[0] != "_" and name not in ("training", *self.assignable)
+        if counts and getattr(self, name, LIVE) is not value:
+            count_change()
         if _settable(self, name):  # a module would become a part of another without passing the setter
             object.__setattr__(self, name, value)
         else:
@@ -58,6 +76,7 @@ class Fixed:
 
     def __delattr__(self, name: str) -> None:
         _check(self, name)
+        count_change()
         super().__delattr__(name)
 
 
@@ -187,12 +206,14 @@ def assign(thing: Any, **values: Any) -> None:
             setattr(thing, name, value)
     finally:
         if made:
+            count_change()
             vars(thing)["_made"] = True
 
 
 def changed(thing: T, **values: Any) -> T:
     """A copy with other attributes; its other parts are shared. Numbers replace the content of a buffer."""
     other = copy.copy(thing)
+    made = getattr(other, "__dict__", {}).pop("_made", None)  # a new object, which no recording knows
     if isinstance(thing, nn.Module):
         for part in ("_parameters", "_buffers", "_modules"):
             vars(other)[part] = dict(vars(thing)[part])
@@ -203,6 +224,8 @@ def changed(thing: T, **values: Any) -> T:
                 kept = isinstance(old, nn.Parameter)
                 values[name] = nn.Parameter(given.detach(), old.requires_grad) if kept else given
     assign(other, **values)
+    if made:
+        vars(other)["_made"] = True
     return other
 
 

@@ -1,17 +1,17 @@
-"""Recording launches, as CUDA graphs or lists for a CPU, and checking whether a recording is still valid."""
+"""Recording launches, as CUDA graphs or lists for a CPU."""
 
 from __future__ import annotations
 
 import gc
 import threading
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from contextlib import suppress
 from typing import Any
 
 import torch
 from torch import nn
 
-from gaussian_swaying._fixed import Fixed
+from gaussian_swaying._fixed import Fixed, version
 from gaussian_swaying.kernels.language import INTERPRETED
 
 RECORDED = 200_000
@@ -21,14 +21,16 @@ _RECORDING = threading.Lock()
 """Held while a graph is recorded: PyTorch cannot give memory back to the driver during that time."""
 
 
-class Recordable(Fixed):
-    """Base of modules that may be recorded in a CUDA graph.
+class Component(Fixed):
+    """Base of modules that may be recorded in a CUDA graph, or have a device function.
+
+    A subclass inherits neither, because it may compute something else: one with its own ``forward`` sets ``recordable``
+    itself, and one that computes the same says ``device_function = Base.device_function``.
 
     Attributes:
         recordable: Whether ``forward`` can be recorded, and replayed at other times and substeps. For this it must
             depend only on its arguments and on numbers and buffers of the module, must never make the host wait, and
-            must copy nothing to or from the host after the first call. A class that defines its own ``forward`` must
-            set this itself.
+            must copy nothing to or from the host after the first call.
     """
 
     recordable = False
@@ -37,41 +39,36 @@ class Recordable(Fixed):
         super().__init_subclass__(**options)
         if "forward" in vars(cls):
             cls.recordable = vars(cls).get("recordable", False)
+        if "device_function" not in vars(cls):
+            cls.device_function = Component.device_function  # type: ignore[method-assign]
+
+    def device_function(self) -> Any:
+        """The ``DeviceFunction``; None for a component that runs in torch only. Cheap: numbers are taken later."""
+        return None
+
+    def nearest_device_function(self) -> Any:
+        """The device function, or else that of the nearest base that has one."""
+        own = (vars(kind).get("device_function", Component.device_function) for kind in type(self).__mro__)
+        return next((one for one in own if one is not Component.device_function), Component.device_function)(self)
 
 
-_PLAIN = frozenset((bool, int, float, str, type(None)))
+def recorded_key(modules: Sequence[nn.Module]) -> tuple[object, ...]:
+    """What a recording of modules depends on: other objects, addresses of tensors or settings need another recording.
 
-
-def fingerprint(modules: Iterable[nn.Module]) -> tuple[tuple[object, ...], ...]:
-    """Everything that modules depend on except the contents of their tensors; equal until a part is replaced.
-
-    It covers types, numbers, strings, the addresses of tensors and the identities of other objects. A change inside an
-    object that is not a module, such as a region, is not detected.
+    What is in the tensors is read at each replay. A change inside an object that is neither a module nor a setting is
+    not detected.
     """
-    found: list[tuple[object, ...]] = []
-    for module in modules:
-        for part in _parts(module):
-            own = [(n, v if type(v) in _PLAIN else id(v)) for n, v in vars(part).items() if n[0] != "_"]
-            found.append((type(part), *own, *((t.data_ptr(), t.shape) for t in _own_tensors(part))))
-    return tuple(found)
+    return (version(), *modules, *((tensor.data_ptr(), tensor.shape) for tensor in tensors_in(modules)))
 
 
 def tensors_in(modules: Iterable[nn.Module]) -> list[torch.Tensor]:
     """All parameters and buffers of modules, many times faster than ``parameters()`` and ``buffers()``."""
-    return [tensor for module in modules for part in _parts(module) for tensor in _own_tensors(part)]
-
-
-def _parts(module: nn.Module) -> Iterator[nn.Module]:
-    """Yield a module and all its submodules; one that is used several times comes several times."""
-    yield module
-    for child in vars(module)["_modules"].values():
-        if child is not None:
-            yield from _parts(child)
-
-
-def _own_tensors(part: nn.Module) -> list[torch.Tensor]:
-    values = vars(part)
-    return [t for t in (*values["_parameters"].values(), *values["_buffers"].values()) if t is not None]
+    found: list[torch.Tensor] = []
+    for module in modules:
+        own = vars(module)
+        found += [t for t in (*own["_parameters"].values(), *own["_buffers"].values()) if t is not None]
+        found += tensors_in(child for child in own["_modules"].values() if child is not None)
+    return found
 
 
 class Replayed:

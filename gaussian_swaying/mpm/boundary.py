@@ -21,8 +21,7 @@ from torch import Tensor, nn
 from gaussian_swaying._fixed import changed
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Region, RegionInFrame, whereabouts
-from gaussian_swaying.kernels.graphs import Recordable
-from gaussian_swaying.mpm.device_functions import Compilable
+from gaussian_swaying.kernels.graphs import Component
 
 BY_BODY = "by body"
 """The kind of a pin that becomes a hinge for a sheet, and a clamp for anything else."""
@@ -70,7 +69,7 @@ class Nodes:
         return self.share > self.threshold
 
 
-class Boundary(Recordable, Compilable, nn.Module, ABC):
+class Boundary(Component, nn.Module, ABC):
     """Base class of all boundary conditions.
 
     Args:

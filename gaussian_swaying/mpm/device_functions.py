@@ -24,8 +24,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying._fixed import Fixed
-from gaussian_swaying.kernels.graphs import fingerprint, tensors_in
+from gaussian_swaying.kernels.graphs import recorded_key, tensors_in
 
 
 @dataclass(frozen=True)
@@ -74,31 +73,6 @@ class DeviceFunction:
     implicit: bool = False
     adjoint: Any = None
     parts: tuple[DeviceFunction, ...] = ()
-
-
-class Compilable(Fixed):
-    """Base of components that may have a device function.
-
-    A subclass does not inherit it, because it may compute something else. One that computes the same says
-    ``device_function = Base.device_function``.
-    """
-
-    def __init_subclass__(cls, **settings: Any) -> None:
-        super().__init_subclass__(**settings)
-        if "device_function" not in vars(cls):
-            cls.device_function = Compilable.device_function  # type: ignore[method-assign]
-
-    def device_function(self) -> DeviceFunction | None:
-        """The device function; None for a component that runs in torch only. It is cheap: numbers are taken later."""
-        return None
-
-    def nearest_device_function(self) -> DeviceFunction | None:
-        """The device function, or else that of the nearest base that has one."""
-        own = (vars(kind).get("device_function", Compilable.device_function) for kind in type(self).__mro__)
-        found: DeviceFunction | None = next(
-            (one for one in own if one is not Compilable.device_function), Compilable.device_function
-        )(self)
-        return found
 
 
 class Constant:
@@ -212,10 +186,9 @@ class Tables:
             tensors = [source for source in one.sources if isinstance(source, Tensor)] + tensors_in(modules)
             key = None
             if not any(tensor.is_inference() for tensor in tensors):
-                ids = tuple(map(id, (*modules, *tensors)))
-                key = (ids, fingerprint(modules), tuple(tensor._version for tensor in tensors))
+                key = (*recorded_key(modules), [(id(tensor), tensor._version) for tensor in tensors])
             if key is None or k not in self._seen or key != self._seen[k][0]:
-                changed, self._seen[k] = True, (key, (modules, tensors))  # so that no new object gets an old id
+                changed, self._seen[k] = True, (key, tensors)  # so that no new tensor gets an old id
                 for first, values in entries:
                     if values.count:
                         found = values.take()

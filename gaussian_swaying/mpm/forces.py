@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from gaussian_swaying._checks import check_like, check_shape
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.kernels.derive import Memory, on_tensors
-from gaussian_swaying.kernels.graphs import Recordable, tensors_in
-from gaussian_swaying.mpm.device_functions import Compilable, Composed, DeviceFunction
+from gaussian_swaying.kernels.graphs import Component, tensors_in
+from gaussian_swaying.mpm.device_functions import Composed, DeviceFunction
 from gaussian_swaying.mpm.state import State
 
 MOST_STEPS = 256
@@ -24,7 +24,7 @@ Given = Tensor | tuple[Tensor, Tensor | None]
 ForceFunction = Callable[[State], Given]
 
 
-class Force(Recordable, Compilable, nn.Module):
+class Force(Component, nn.Module):
     """Base class of all forces: computes the force on every particle from the state, in torch.
 
     A custom force is a subclass with a ``forward`` in torch, or with a ``device_function``, which also runs inside the

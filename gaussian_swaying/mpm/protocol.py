@@ -103,11 +103,6 @@ class Solver(nn.Module, ABC):
         return 0.0
 
     @property
-    def identity(self) -> object:
-        """An object that is replaced when anything changes that stays constant during a run."""
-        return self.points
-
-    @property
     def exact(self) -> bool:
         """True if no substep is unstable, however fast the waves and however strong the drag."""
         return False

@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from gaussian_swaying.kernels.graphs import Repeater, fingerprint
+from gaussian_swaying.kernels.graphs import Repeater, recorded_key
 from gaussian_swaying.kernels.language import INTERPRETED
 from gaussian_swaying.kernels.launch import call, compiles, lanes, launch
 from gaussian_swaying.mpm import shared_kernels as kernels
@@ -227,7 +227,7 @@ class Fused(ABC):
         """Return the key of the recorded numbers of forces with device functions; None if they cannot be recorded."""
         here = all(tensor.device == self.device for tensor in tensors_of(forces))
         recordable = here and all(force.recordable for force in forces)
-        return (*forces, self.loads.layout, fingerprint(forces)) if recordable else None
+        return (self.loads.layout, *recorded_key(forces)) if recordable else None
 
     def places(self) -> tuple[int, int]:
         """Return the addresses of the numbers of forces, which recorded graphs contain."""
@@ -273,8 +273,8 @@ class Fused(ABC):
         return added([split(force(state), force, state) for force in self.asked])
 
     def _asked_key(self) -> tuple[object, ...]:
-        """Return the key of the recorded forces; it refers to them, so that no new object gets the id of an old one."""
-        return (self.asked, fingerprint(self.asked)) if self.asked else ()
+        """Return the key of the recorded forces."""
+        return recorded_key(self.asked) if self.asked else ()
 
     def _resists(self, state: MPMState) -> bool:
         """True if a force in torch returns a resistance; calls each force once."""

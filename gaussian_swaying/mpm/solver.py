@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint as recomputed
 
 from gaussian_swaying._checks import check_positive, check_vector
-from gaussian_swaying._fixed import Fixed, FixedList, assign
+from gaussian_swaying._fixed import Fixed, FixedList, assign, count_change
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.boundary import Boundary
 from gaussian_swaying.mpm.contact import Surface
@@ -181,11 +181,6 @@ class MPMSolver(Fixed, Solver):
         """The laws of the material given to :meth:`init_state`, bound to its particles."""
         return self.bound.laws
 
-    @property
-    def identity(self) -> Formulation:
-        """The formulation bound to the material; another material, device or precision makes another one."""
-        return self.bound
-
     def prepare(self) -> None:
         """Make the kernels, if they are used; their errors are raised here."""
         self.fused()
@@ -262,6 +257,7 @@ class MPMSolver(Fixed, Solver):
         bound = FORMULATIONS[self.formulation](points, boundaries, self.settings, surface)
         self._obstacle = self._why_not_kernels(bound)
         self._bound = bound
+        count_change()
 
     def _choice(
         self, points: MaterialPoints, boundaries: Sequence[Boundary], surface: Surface | None

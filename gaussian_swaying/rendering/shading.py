@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_positive, check_shape, check_vector
-from gaussian_swaying.kernels.graphs import Recordable
+from gaussian_swaying.kernels.graphs import Component
 
 REST_FLOOR = 0.1
 """Relative shading clamps the factors of the moving and the rest normal to at least this before it divides them."""
@@ -145,7 +145,7 @@ def _check_rest(relative: bool, rest_normal: Tensor | None) -> Tensor | None:
     return rest_normal if relative else None
 
 
-class Shader(Recordable, nn.Module, ABC):
+class Shader(Component, nn.Module, ABC):
     """Base class of the shaders that a configuration can name.
 
     For a custom shader, write a subclass with a ``forward``. If that never makes the host wait, set ``recordable =

@@ -22,7 +22,7 @@ from gaussian_swaying.gaussians.export import export_cloud
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.gaussians.ply import check_folder
-from gaussian_swaying.kernels.graphs import RECORDED, Replayed, fingerprint
+from gaussian_swaying.kernels.graphs import RECORDED, Replayed, recorded_key
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.recording.layout import check_camera_name
 from gaussian_swaying.rendering import passes
@@ -173,7 +173,7 @@ class Painter(Fixed, nn.Module):
             return [found.means, found.covariances, found.normals, *([found.rotations] if turned else [])]
 
         given = [getattr(state, name) for name in follow.reads]
-        found = self._moved((fingerprint([scene]), follow.layout(state)), moved, *given)
+        found = self._moved((recorded_key([scene]), follow.layout(state)), moved, *given)
         parts: dict[str, Any] = dict(zip(("means", "covariances", "normals", "rotations"), found, strict=False))
         return replace(scene.rest(), **parts)
 
@@ -194,7 +194,7 @@ class Painter(Fixed, nn.Module):
         given += [gaussians.rotations] if scene.model.view_dependent else []
         if len(means) > RECORDED or not (shader is None or shader.recordable):
             return self._colors(*given)
-        key = fingerprint([scene, *([] if shader is None else [shader])])
+        key = recorded_key([scene, *([] if shader is None else [shader])])
         return self._coloured(key, lambda *known: [self._colors(*known)], *given)[0]
 
     def _colors(self, eye: Tensor, means: Tensor, normals: Tensor, rotations: Tensor | None = None) -> Tensor:
@@ -222,7 +222,7 @@ class Painter(Fixed, nn.Module):
         parts = (model.means, model.sh0, model.shN, camera.world_to_camera)
         if any(part.is_inference() or (part.requires_grad and torch.is_grad_enabled()) for part in parts):
             return self._rest_colours(eye)
-        key = (fingerprint([self.scene]), *(part._version for part in parts))
+        key = (recorded_key([self.scene]), *(part._version for part in parts))
         if self._rest is None or self._rest[0] is not camera or self._rest[1] != key:
             with torch.inference_mode(False), torch.no_grad():  # they outlive the call
                 self._rest = (camera, key, *self._rest_colours(eye.clone()))

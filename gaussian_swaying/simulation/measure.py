@@ -357,7 +357,7 @@ class Gauge:
             before: The state at the start of the frame.
             more: Function of the state that computes further numbers.
             same: Key of all else that ``more`` depends on; another key makes another recording. None to record nothing.
-            lift: As in :func:`measure`; it changes only with ``solver.identity``.
+            lift: As in :func:`measure`; it changes only with ``same``.
         """
         small = state.position.is_cuda and state.position.shape[:-1].numel() <= RECORDED
         fixed = solver.neighbours_fixed and state.F_elastic is state.F_total
@@ -375,7 +375,7 @@ class Gauge:
             return [self._made.values]
 
         given = [*(getattr(before, name) for name in first), *(getattr(state, name) for name in names)]
-        key = (solver.identity, *same)
+        key = (solver, *same)
         (found,) = self.replayed(key, values, cfl, *given)
         assert self._made is not None
         return self._made.again(substeps, found)

@@ -19,7 +19,7 @@ from gaussian_swaying._fixed import assign
 from gaussian_swaying._turns import Turn, in_turn
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.geometry.regions import whereabouts
-from gaussian_swaying.kernels.graphs import fingerprint, tensors_in
+from gaussian_swaying.kernels.graphs import recorded_key, tensors_in
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.joints import Joints
 from gaussian_swaying.mpm.modes import MOST_LEAN, Modes
@@ -765,7 +765,7 @@ def parts_of(stepper: Stepper) -> tuple[object, ...] | None:
         return None
     made = {id(tensor) for tensor in wind.refreshed()}  # from the state, in every frame
     versions = tuple(tensor._version for tensor in tensors if id(tensor) not in made)
-    return (stepper.solver.identity, fingerprint([wind]), versions)
+    return (*recorded_key([stepper.solver, wind]), versions)
 
 
 def needs_of(stepper: Stepper, state: State, winds: Tensor | None) -> Tensor:

@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.gaussians.parts import ROLES
-from gaussian_swaying.kernels.graphs import fingerprint
 from gaussian_swaying.viewer.brushes import BRUSH, Brushes
 from gaussian_swaying.viewer.film.page import PAGE
 from gaussian_swaying.viewer.session import Snapshot
@@ -177,7 +176,7 @@ class Streams:
         Raises:
             Exception: What went wrong when it was made.
         """
-        key = (snapshot.simulation, fingerprint([snapshot.simulation.scene]))
+        key = (snapshot.simulation, snapshot.simulation.scene)
 
         def make() -> None:
             try:

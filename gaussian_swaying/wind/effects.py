@@ -20,9 +20,9 @@ from gaussian_swaying._fixed import changed
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.linalg_triton import add3, chosen, cross3, dot3, matvec, scale3, transpose
 from gaussian_swaying.kernels.derive import Memory, on_tensors
-from gaussian_swaying.kernels.graphs import Recordable
+from gaussian_swaying.kernels.graphs import Component
 from gaussian_swaying.kernels.language import tl, triton
-from gaussian_swaying.mpm.device_functions import Compilable, DeviceFunction, Numbers
+from gaussian_swaying.mpm.device_functions import DeviceFunction, Numbers
 
 SPREAD = 58.0
 """The updraft of a plume falls off as exp(-SPREAD r^2 / z^2)."""
@@ -77,7 +77,7 @@ class Moment:
     carried: Tensor
 
 
-class WindEffect(Recordable, Compilable, nn.Module):
+class WindEffect(Component, nn.Module):
     """Base of effects, which change the wind from place to place.
 
     A subclass has a ``device_function`` (:mod:`~gaussian_swaying.mpm.device_functions`), or else a ``forward`` in

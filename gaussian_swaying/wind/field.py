@@ -28,7 +28,7 @@ from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.keyed_path import picked
 from gaussian_swaying.geometry.linalg_triton import add3, load3, scale3, store3
 from gaussian_swaying.kernels.derive import on_tensors
-from gaussian_swaying.kernels.graphs import Recordable
+from gaussian_swaying.kernels.graphs import Component
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.kernels.launch import lanes, launch, replaces
 from gaussian_swaying.wind.effects import Moment, WindEffect
@@ -132,7 +132,7 @@ def _modulate(
     store3(velocity, 1, 3 * index, v, mask)
 
 
-class Modulation(Recordable, nn.Module, ABC):
+class Modulation(Component, nn.Module, ABC):
     """Base of all modulations, which change the wind velocity at a given time."""
 
     live_as = "wind.modulations.*"
@@ -231,7 +231,7 @@ class FlowKey:
     flow: list[float]
 
 
-class SpatialWind(Recordable, nn.Module, ABC):
+class SpatialWind(Component, nn.Module, ABC):
     """Base of winds that vary in space: a jet, a boundary layer, a travelling gust.
 
     For a custom wind, write a subclass with a ``forward``. If it can be recorded in a CUDA graph (see ``Force``), set

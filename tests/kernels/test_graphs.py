@@ -1,13 +1,16 @@
 """What a CUDA graph may record, and when a recorded one no longer holds."""
 
+import copy
+
 import pytest
 import torch
 from catalogue import BOUNDARIES
 from torch import nn
 
 from gaussian_swaying import Boundary, Box, GaussianGust, PinnedRegion, SineSway, UniformGust, WindField
+from gaussian_swaying._fixed import assign, changed
 from gaussian_swaying.geometry.regions import Everything, Not, Union
-from gaussian_swaying.kernels.graphs import Repeater, Replayed, tensors_in
+from gaussian_swaying.kernels.graphs import Repeater, Replayed, recorded_key, tensors_in
 from gaussian_swaying.mpm.colliders import VelocityBox
 from gaussian_swaying.wind.field import Modulation
 
@@ -44,6 +47,36 @@ def test_tensors_of_modules():
     expected = [*wind.parameters(), *wind.buffers()]
     assert {id(tensor) for tensor in tensors_in([wind])} == {id(tensor) for tensor in expected}
     assert len(tensors_in([wind, WindField()])) == len(expected) + 2
+
+
+def test_what_makes_a_recording_invalid():
+    """Not what is in tensors, nor what is private, nor other objects that are made; but all else."""
+
+    class Own(UniformGust):
+        share = 1.0
+
+    gust = Own()
+    gust.register_buffer("table", torch.zeros(3))
+    before = recorded_key([gust])
+    gust.table += 1.0
+    gust.share, gust._known = gust.share, 2.0
+    gust.eval()
+    changed(gust, delta=0.1)
+    Own(0.3)
+    assert recorded_key([gust]) == before
+    for change in (
+        lambda: setattr(gust, "share", 2.0),
+        lambda: assign(gust, delta=0.7),
+        lambda: setattr(gust, "table", torch.zeros(3)),
+        lambda: gust.register_buffer("table", torch.zeros(4)),
+        gust.double,
+        lambda: delattr(gust, "table"),
+    ):
+        change()
+        after = recorded_key([gust])
+        assert after != before
+        before = after
+    assert recorded_key([copy.copy(gust)]) != before
 
 
 def test_regions_say_for_themselves_whether_they_can_be_recorded():
