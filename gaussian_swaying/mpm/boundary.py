@@ -97,6 +97,11 @@ class Boundary(Component, nn.Module, ABC):
         if not self.start < self.end:
             raise ValueError(f"Expected `end` to be later than `start` ({self.start} s), but got {self.end} s.")
 
+    @property
+    def window(self) -> list[float]:
+        """The times between which it acts [s]."""
+        return [self.start, self.end]
+
     def in_frame(self, frame: SimFrame) -> Boundary:
         """The same condition with its geometry converted from scene units to metres, z up."""
         return self

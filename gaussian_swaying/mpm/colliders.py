@@ -1,7 +1,7 @@
 """What the material cannot enter or leave: planes, boxes, and rigid obstacles that may move.
 
 The distance from a solid is one device function (:mod:`~gaussian_swaying.geometry.distance`), which torch runs on
-tensors and the kernels call (:class:`Solids`).
+tensors and the kernels call.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Container, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -31,9 +32,8 @@ from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.geometry.rotations import rotation_of
 from gaussian_swaying.kernels.derive import on_tensors
 from gaussian_swaying.mpm.boundary import Boundary, Nodes
-from gaussian_swaying.mpm.device_functions import Composed, DeviceFunction, Numbers, Tables
-from gaussian_swaying.mpm.forces import MOST_STEPS
-from gaussian_swaying.mpm.touch import POSE, ROW, stopped
+from gaussian_swaying.mpm.device_functions import DeviceFunction, Numbers
+from gaussian_swaying.mpm.touch import POSE, stopped
 
 KINDS = ("sticky", "slip", "separate")
 
@@ -103,7 +103,8 @@ class Plane(Boundary):
         return torch.where((behind & self.active(nodes.time))[..., None], stopped, velocity)
 
     def device_function(self) -> DeviceFunction:
-        return DeviceFunction(half_space_distance, numbers=Numbers(3, lambda: self.normal), sources=(self,))
+        solid = DeviceFunction(half_space_distance, numbers=Numbers(3, lambda: self.normal), sources=(self,))
+        return _placed(solid, 0.0, self.friction, self.point)
 
 
 class EnclosingBox(Boundary):
@@ -252,7 +253,14 @@ class Obstacle(Boundary):
         raise NotImplementedError(f"{type(self).__name__} has neither `solid` nor `distance`.")
 
     def device_function(self) -> DeviceFunction | None:
-        return self.solid()
+        """That of :meth:`solid`, with what :func:`~gaussian_swaying.mpm.touch.touch` reads."""
+        placed = _placed(self.solid(), self.gap, self.friction, self.center)
+        return placed if self.still else replace(placed, per_substep=Numbers(POSE.value, self._poses))
+
+    def _poses(self, time: Tensor, dt: Tensor, steps: int) -> Tensor:
+        """The numbers of :meth:`motion` at the start of some substeps, shape (steps, 24)."""
+        found = self.motion(time + dt * torch.arange(steps, device=time.device), dt)
+        return torch.cat([part.reshape(steps, -1) for part in found], 1)
 
     def distance(self, place: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance from its surface and the gradient of it, at rest; in torch.
@@ -315,6 +323,17 @@ class Obstacle(Boundary):
         distance, normal, own = self.touch(nodes.position, nodes.time, nodes.dt)
         stopped = own + plane_velocity(velocity - own, normal, "separate", self.friction)
         return torch.where(((distance <= 0) & self.active(nodes.time))[..., None], stopped, velocity)
+
+
+def _placed(solid: DeviceFunction, gap: float, friction: float, centre: Tensor) -> DeviceFunction:
+    """The device function of a solid whose numbers begin with gap, friction and place of its centre."""
+
+    def numbers() -> Tensor:
+        shape = torch.as_tensor(own.take()).to(centre)
+        return torch.cat([centre.new_tensor([gap, friction]), centre, shape.reshape(-1)])
+
+    own = solid.numbers
+    return replace(solid, numbers=Numbers(5 + own.count, numbers))
 
 
 def grid_device_function(obstacle: Obstacle, grid: DistanceGrid, axes: Tensor) -> DeviceFunction:
@@ -617,7 +636,7 @@ class StillGaussians(Obstacle):
         )
 
     def device_function(self) -> DeviceFunction | None:
-        return None if self.spacing == 0 else self.solid()
+        return None if self.spacing == 0 else Obstacle.device_function(self)
 
 
 Solid = Plane | Obstacle
@@ -634,52 +653,3 @@ def solids_of(boundaries: Sequence[Boundary], pins: Container[int] = ()) -> list
     if any(boundary.device_function() is None for boundary, _ in others):
         return None
     return [(part, k) for one, k in others for part in one.modules() if isinstance(part, Solid)]
-
-
-class Solids:
-    """Tables of solids at fixed addresses, which recorded graphs contain.
-
-    Args:
-        parts: The solids, each with the number of its boundary.
-        like: A tensor of the type and device of the tables.
-
-    Attributes:
-        device functions: Their device functions.
-        kinds: For each, its kind of contact in :data:`KINDS`.
-        moves: For each, whether it moves.
-    """
-
-    def __init__(self, parts: Sequence[tuple[Solid, int]], like: Tensor) -> None:
-        self.parts, device = list(parts), like.device
-        count, found = len(self.parts), [part.device_function() for part, _ in self.parts]
-        self._device_functions = [device_function for device_function in found if device_function is not None]
-        self.device_functions, self.tables = Composed(self._device_functions), Tables(device, like.dtype)
-        self.kinds = tuple(KINDS.index(part.kind if isinstance(part, Plane) else "separate") for part, _ in self.parts)
-        self.moves = tuple(isinstance(part, Obstacle) and not part.still for part, _ in self.parts)
-        self.rows = like.new_zeros(count, ROW.value)
-        self.windows = torch.zeros(count, 2, dtype=torch.float64, device=device)
-        self.poses = like.new_zeros(MOST_STEPS if any(self.moves) else min(count, 1), count, POSE.value)
-
-    def take(self) -> None:
-        """Fill the tables; again only if one of the solids was changed."""
-        if not self.tables.take(self._device_functions, self.device_functions, numbers=True):
-            return
-        for m, (part, boundary) in enumerate(self.parts):
-            gap, center = (0.0, part.point) if isinstance(part, Plane) else (part.gap, part.center)
-            self.rows[m, :3].copy_(torch.tensor([gap, part.friction, float(boundary)]))
-            self.windows[m].copy_(torch.tensor([part.start, part.end], dtype=torch.float64))
-            self.poses[:, m, :3] = center.to(self.poses)
-
-    def prepare(self, time: Tensor, dt: Tensor, steps: int) -> None:
-        """Compute the poses of some substeps.
-
-        Args:
-            time: Time of the first [s], scalar float64 tensor on the device.
-            dt: Substep [s], as ``time``.
-            steps: Number of substeps.
-        """
-        for m, (part, _) in enumerate(self.parts):
-            if self.moves[m] and isinstance(part, Obstacle):
-                found = part.motion(time + dt * torch.arange(steps, device=time.device), dt)
-                rows = torch.cat([each.reshape(steps, -1) for each in found], 1)
-                self.poses[:steps, m].copy_(rows)

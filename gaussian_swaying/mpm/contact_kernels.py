@@ -9,7 +9,7 @@ pair is kept at both of its samples; the sums at samples and nodes have the same
 from gaussian_swaying.geometry.linalg_triton import add3, dot3, load3
 from gaussian_swaying.kernels.language import ON_GPU, tl, triton
 from gaussian_swaying.mpm.shared_kernels import VARIES, axis_weights, node_weight, vector
-from gaussian_swaying.mpm.touch import POSE, acts, touch
+from gaussian_swaying.mpm.touch import acts, touch
 
 CHANGES = (*VARIES, "places", "touched_nodes", "active_nodes", "last", "iterations")
 
@@ -738,8 +738,8 @@ def contact_solve(
 
 @triton.jit(do_not_specialize=VARIES)
 def obstacle_places(
-    position, moving, thickness, gap, facing, drive, valid, within, places, row, window, pose, numbers, time, dt, slack,
-    first_step, step_offset, SOLIDS: tl.constexpr, MOVES: tl.constexpr, BLOCK: tl.constexpr,
+    position, moving, thickness, gap, facing, drive, valid, within, places, window, numbers, rows, time, dt, slack,
+    first_step, step_offset, SOLIDS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Constraints of all contact samples with the first obstacle in ``total``: gap, normal, velocity, and if it acts.
 
@@ -748,10 +748,9 @@ def obstacle_places(
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = k < places
     at = position + k * 3
-    if MOVES:
-        pose += (tl.load(first_step) + step_offset) * POSE
     x = (tl.load(at, mask, 0.0), tl.load(at + 1, mask, 0.0), tl.load(at + 2, mask, 0.0))
-    distance, normal, own = touch(x, row, pose, numbers, mask, SOLIDS, 0, MOVES)
+    step = tl.load(first_step) + step_offset
+    distance, normal, own = touch(x, numbers, rows, step, mask, SOLIDS, 0)
     distance -= 0.5 * tl.load(thickness + k, mask, 0.0)
     on = tl.where(acts(window, tl.load(time)), 1.0, 0.0) + tl.zeros_like(distance)
     v = moving + k * 4

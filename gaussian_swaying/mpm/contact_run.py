@@ -9,8 +9,9 @@ from torch import Tensor
 
 from gaussian_swaying.kernels.launch import lanes, launch
 from gaussian_swaying.mpm import contact_kernels as kernels
-from gaussian_swaying.mpm.colliders import Solids
 from gaussian_swaying.mpm.contact import ContactStage
+from gaussian_swaying.mpm.device_functions import DeviceFunction, Packed
+from gaussian_swaying.mpm.forces import MOST_STEPS
 from gaussian_swaying.mpm.run import INTERPRETED, MAX_INDEX
 
 if TYPE_CHECKING:
@@ -114,11 +115,14 @@ class ContactRun:
         self.marked = self._zeros(len(fields), **whole)
         self.within = self.status[int(kernels.WITHIN.value)]
         self.friction = fields.new_tensor([float(b.friction) for _, b in stage.obstacles] or [0.0])
-        self.solids = [
-            None if obstacle.device_function() is None else Solids([(obstacle, 0)], fields)
-            for _, obstacle in stage.obstacles
+        windows = [obstacle.window for _, obstacle in stage.obstacles]
+        self.windows = torch.tensor(windows, dtype=torch.float64, device=self.device)
+        like: dict[str, Any] = {"dtype": fields.dtype, "device": self.device}
+        functions = [obstacle.device_function() for _, obstacle in stage.obstacles]
+        self.solids: list[tuple[Packed, list[DeviceFunction]] | None] = [
+            None if one is None else (Packed(torch.Size([1]), like, fixed=True), [one]) for one in functions
         ]
-        """For each obstacle its tables; None for one that runs in torch."""
+        """For each obstacle its numbers; None for one that runs in torch."""
         self.programs = self._programs()
         self._take_room(*((ROOM, SLOTS) if stage.contact is not None else (1, walls)))
 
@@ -226,8 +230,8 @@ class ContactRun:
         self.motion.zero_()
         for solid in self.solids:
             if solid is not None:
-                solid.take()
-                solid.prepare(time, dt, steps)
+                solid[0].take(solid[1], MOST_STEPS)
+                solid[0].begin(time, dt, steps)
 
     def add_taken(self, taken: Tensor) -> None:
         """Add what each boundary took since ``pressed_sum`` was zero [N s], to (scenes, B, 3), float64."""
@@ -263,11 +267,12 @@ class ContactRun:
             self._read()
             for k, (solid, (_, obstacle)) in enumerate(zip(self.solids, stage.obstacles, strict=True)):
                 if solid is not None:
+                    packed = solid[0]
                     launch(kernels.obstacle_places, (-(-self.places // one),))(
                         self.position, self.moving, self.thickness, self.wall_gap[k], self.wall_normal[k],
-                        self.wall_drive[k], self.wall_valid[k], self.within, self.places, solid.rows, solid.windows,
-                        solid.poses, solid.tables.buffer, time, dt, SLACK * dx, first_step, offset,
-                        SOLIDS=solid.device_functions, MOVES=solid.moves[0], BLOCK=one, num_warps=4,
+                        self.wall_drive[k], self.wall_valid[k], self.within, self.places, self.windows[k],
+                        packed.buffer, packed.rows, time, dt, SLACK * dx, first_step, offset,
+                        SOLIDS=packed.layout, BLOCK=one, num_warps=4,
                     )  # fmt: skip
                     continue
                 gap, normal, drive = obstacle.touch(self.position, time, dt)

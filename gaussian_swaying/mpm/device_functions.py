@@ -148,40 +148,56 @@ def device_key(function: Any) -> str:
     return str(getattr(function, "cache_key", "")) + repr(function)
 
 
-class Tables:
-    """Numbers and tables of device functions in one buffer; those of one are written only if its sources have changed.
+def _pieces(
+    given: Sequence[DeviceFunction], layout: Composed, start: int, numbers: bool
+) -> Iterator[tuple[DeviceFunction, list[tuple[int, Numbers]]]]:
+    """Yield each device function and its parts with the places of its numbers and of its table in a buffer."""
+    for one, part, (first, _), table in zip(given, layout.parts, layout.numbers, layout.tables, strict=True):
+        yield from _pieces(one.parts, part, start + table, True)
+        yield (one, [(start + first, one.numbers if numbers else NONE), (start + table + part.size, one.table)])
+
+
+class Packed:
+    """The numbers and tables of device functions in buffers, at addresses that recordings contain.
 
     Args:
-        device: Device of the buffer.
-        dtype: Its type.
+        batch: Shape of a field of one number for each point, (..., P); (1,) for solids, which have no points.
+        like: Type and device of the numbers.
+        fixed: Whether ``numbers`` change with the ``sources`` only; if not, they are taken in every rollout.
 
     Attributes:
-        buffer: The numbers and tables, at the places that :class:`Composed` says. Its address changes if it
-            must grow.
+        layout: Where each finds its numbers.
+        buffer: Numbers and tables. Its address changes if it must grow.
+        rows: The numbers of each substep and scene; as ``buffer``.
     """
 
-    def __init__(self, device: torch.device, dtype: torch.dtype = torch.float32) -> None:
-        self.buffer = torch.zeros(1, dtype=dtype, device=device)
-        self._layout: Composed | None = None
+    def __init__(self, batch: torch.Size, like: dict[str, Any], fixed: bool = False) -> None:
+        self.batch, self.scenes, self.like, self.fixed = batch, max(1, batch[:-1].numel()), like, fixed
+        self.given: Sequence[DeviceFunction] = ()
+        self.layout, self.buffer, self.rows = Composed(()), torch.zeros(1, **like), torch.zeros(0, **like)
         self._seen: dict[int, tuple[object, object]] = {}
 
-    def take(self, given: Sequence[DeviceFunction], layout: Composed, numbers: bool = False) -> bool:
-        """Bring the buffer up to date.
+    def take(self, given: Sequence[DeviceFunction], steps: int) -> Tensor | None:
+        """Bring the buffers up to date; what one device function has is written only if its sources have changed.
 
         Args:
-            given: The device functions.
-            layout: The same, composed.
-            numbers: Whether to take their ``numbers``, too; those of their parts are always taken.
+            given: The device functions; the same list need not be composed again.
+            steps: Most substeps of a rollout.
 
         Returns:
-            True unless all is as it was; always for tensors of inference mode, whose changes cannot be detected.
+            The numbers of the points, shape (N, n); None if all is as it was. It never is for tensors of inference
+            mode, whose changes cannot be detected.
         """
+        layout, changed = self.layout if given is self.given else Composed(given), False
+        if layout != self.layout:
+            changed, self._seen = True, {}
+        self.given, self.layout = given, layout
         if layout.size > len(self.buffer):
             self.buffer = self.buffer.new_zeros(layout.size)
-        changed = layout != self._layout
-        if changed:
-            self._layout, self._seen = layout, {}
-        for k, (one, entries) in enumerate(_pieces(given, layout, 0, numbers)):
+        room = steps * self.scenes * layout.width
+        if given and len(self.rows) < room:
+            self.rows = torch.zeros(room, **self.like)
+        for k, (one, entries) in enumerate(_pieces(given, layout, 0, self.fixed)):
             modules = [source for source in one.sources if isinstance(source, nn.Module)]
             tensors = [source for source in one.sources if isinstance(source, Tensor)] + tensors_in(modules)
             key = None
@@ -194,64 +210,23 @@ class Tables:
                         found = values.take()
                         found = found if isinstance(found, Tensor) else torch.tensor(found, dtype=torch.float64)
                         self.buffer[first : first + values.count].copy_(found.reshape(-1))
-        return changed
-
-
-def _pieces(
-    given: Sequence[DeviceFunction], layout: Composed, start: int, numbers: bool
-) -> Iterator[tuple[DeviceFunction, list[tuple[int, Numbers]]]]:
-    """Yield each device function and its parts with the places of its numbers and of its table in a buffer."""
-    for one, part, (first, _), table in zip(given, layout.parts, layout.numbers, layout.tables, strict=True):
-        yield from _pieces(one.parts, part, start + table, True)
-        yield (one, [(start + first, one.numbers if numbers else NONE), (start + table + part.size, one.table)])
-
-
-class Loads:
-    """The numbers of the forces that kernels compute, at addresses that recordings contain.
-
-    Args:
-        batch: Shape of a field of one number for each point, (..., P).
-        like: Type and device of the numbers.
-
-    Attributes:
-        layout: The forces, composed.
-        tables: Their numbers and tables.
-        vectors: Their numbers of each substep and scene.
-    """
-
-    def __init__(self, batch: torch.Size, like: dict[str, Any]) -> None:
-        self.batch, self.scenes, self.like = batch, max(1, batch[:-1].numel()), like
-        self.device_functions: Sequence[DeviceFunction] = ()
-        self.layout, self.tables, self.vectors = Composed(()), Tables(**like), torch.zeros(0, **like)
-
-    def take(self, given: Sequence[DeviceFunction], steps: int) -> Tensor | None:
-        """Take all but the numbers of a rollout; those of the points, shape (N, n), or None if they are as they were.
-
-        Args:
-            given: The forces.
-            steps: Most substeps of a rollout.
-        """
-        self.device_functions, self.layout = given, Composed(given)
-        room = steps * self.scenes * self.layout.width
-        if given and len(self.vectors) < room:
-            self.vectors = torch.zeros(room, **self.like)
-        if not self.tables.take(given, self.layout):
+        if not changed:
             return None
-        values = [one.per_point.take() for one in given if one.per_point.count]
-        rows = [value.expand(*self.batch, value.shape[-1]).flatten(0, -2) for value in values]
+        points = [one.per_point.take() for one in given if one.per_point.count]
+        rows = [value.expand(*self.batch, value.shape[-1]).flatten(0, -2) for value in points]
         return torch.cat(rows, dim=-1) if rows else None
 
     def begin(self, time: Tensor, dt: Tensor, steps: int) -> None:
         """Take the numbers of a rollout, from a time on [s]."""
-        for k, (one, (first, many)) in enumerate(zip(self.device_functions, self.layout.numbers, strict=True)):
-            if many:
-                self.tables.buffer[first : first + many].copy_(torch.as_tensor(one.numbers.take()))
+        for k, (one, (first, many)) in enumerate(zip(self.given, self.layout.numbers, strict=True)):
+            if many and not self.fixed:
+                self.buffer[first : first + many].copy_(torch.as_tensor(one.numbers.take()))
             if one.per_substep.count:
                 self.write(k, torch.as_tensor(one.per_substep.take(time, dt, steps)))
 
-    def write(self, force: int, rows: Tensor) -> None:
-        """Write the numbers of a force for some substeps, shape (steps, n) or (steps, scenes, 1, n)."""
+    def write(self, k: int, rows: Tensor) -> None:
+        """Write the numbers of a device function for some substeps, shape (steps, n) or (steps, scenes, 1, n)."""
         steps, width = len(rows), self.layout.width
-        first, count = self.layout.per_substep[force]
-        to = self.vectors[: steps * self.scenes * width].view(steps, self.scenes, width)
+        first, count = self.layout.per_substep[k]
+        to = self.rows[: steps * self.scenes * width].view(steps, self.scenes, width)
         to[..., first : first + count].copy_(rows.reshape(steps, -1, count).expand(-1, self.scenes, -1))

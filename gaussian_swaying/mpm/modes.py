@@ -28,7 +28,7 @@ from gaussian_swaying.kernels.launch import lanes, launch, replaces
 from gaussian_swaying.mpm.boundary import Boundary
 from gaussian_swaying.mpm.contact import Surface
 from gaussian_swaying.mpm.damping import decay_rate
-from gaussian_swaying.mpm.device_functions import DeviceFunction, Loads
+from gaussian_swaying.mpm.device_functions import DeviceFunction, Packed
 from gaussian_swaying.mpm.forces import Force, added, split, tensors_of
 from gaussian_swaying.mpm.formulation import Settings, flowing
 from gaussian_swaying.mpm.modal import Analysis, analysis_of
@@ -496,7 +496,7 @@ class SiteForces:
 
     def __init__(self, rest: Tensor) -> None:
         self.rest, self.sites = rest.contiguous(), rest.shape[-2]
-        self.loads = Loads(rest.shape[:-1], {"dtype": rest.dtype, "device": rest.device})
+        self.loads = Packed(rest.shape[:-1], {"dtype": rest.dtype, "device": rest.device})
         self.values = rest.new_zeros(1)
 
     def prepare(self, forces: Sequence[DeviceFunction], time: Tensor, dt: float, steps: int) -> None:
@@ -527,7 +527,7 @@ class SiteForces:
         block = lanes(moved.device, 128)
         with torch.cuda.device_of(out):
             launch(site_forces, (-(-count // block),))(
-                moved.contiguous(), self.rest, self.values, loads.vectors, loads.tables.buffer, out, count, self.sites,
+                moved.contiguous(), self.rest, self.values, loads.rows, loads.buffer, out, count, self.sites,
                 loads.scenes, step, FORCES=loads.layout, BLOCK=block, num_warps=4,
             )  # fmt: skip
         return out

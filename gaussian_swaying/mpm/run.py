@@ -20,7 +20,7 @@ from gaussian_swaying.kernels.graphs import Repeater, recorded_key
 from gaussian_swaying.kernels.language import INTERPRETED
 from gaussian_swaying.kernels.launch import call, compiles, lanes, launch
 from gaussian_swaying.mpm import shared_kernels as kernels
-from gaussian_swaying.mpm.device_functions import DeviceFunction, Loads
+from gaussian_swaying.mpm.device_functions import DeviceFunction, Packed
 from gaussian_swaying.mpm.dispatch import BodyLaws, in_common
 from gaussian_swaying.mpm.forces import MOST_STEPS, Force, added, divide, split, tensors_of
 from gaussian_swaying.mpm.formulation import Formulation
@@ -81,7 +81,7 @@ class Fused(ABC):
             self.law = points.law_index.reshape(-1).int()
         self.first_step = torch.zeros(1, dtype=torch.int32, device=self.device)
         self.schedule = torch.zeros(MAX_STEPS + 2, kernels.SCHEDULE, **self.like)
-        self.loads = Loads(points.mass.shape, self.like)
+        self.loads = Packed(points.mass.shape, self.like)
         """The forces of the current rollout that the kernels compute."""
         self.load = torch.zeros(8, self.count, **self.like)
         self.force_in = torch.zeros(0, 4, **self.like)
@@ -231,7 +231,7 @@ class Fused(ABC):
 
     def places(self) -> tuple[int, int]:
         """Return the addresses of the numbers of forces, which recorded graphs contain."""
-        return self.loads.tables.buffer.data_ptr(), self.loads.vectors.data_ptr()
+        return self.loads.buffer.data_ptr(), self.loads.rows.data_ptr()
 
     # ---- measures, each in one kernel
 

@@ -467,7 +467,7 @@ class TotalAdjoint(TotalRun):
         self.options = self.options_for(acting)
         self.adjoints = Adjoints(self.laws, acting[0].adjoint if acting else None)
         if numbers is not None:
-            self.loads.tables.buffer[: len(numbers)].copy_(numbers)
+            self.loads.buffer[: len(numbers)].copy_(numbers)
         self._make_room(run.every, loaded)
         self.width = 8 if loaded or self.options["VISCOUS"] else 4
         self.partial = self.sums(self.cells, self.width, "adjoint")
@@ -620,7 +620,7 @@ class TotalAdjoint(TotalRun):
             self.fraction, self.material, self.normals, self.law, self.law_table, self.values, self.count,
             self.piece_start, self.piece_node, self.piece_scene, self.pieces, self.piece_nodes,
             self.fields, self.force_bar, to, self.material_bar, self.shares,
-            self.loads.vectors, self.scenes, self.loads.tables.buffer, self.first_step, offset, self.last,
+            self.loads.rows, self.scenes, self.loads.buffer, self.first_step, offset, self.last,
             ny * nz, nz, 1 / self.grid.dx, self.settings.stiffness_damping,
             LAWS=self.laws, MULTI=options["MULTI"], FORCES=options["FORCES"], VISCOUS=options["VISCOUS"],
             MATERIAL=flags["MATERIAL"], SHARES=flags["SHARES"], WIDTH=self.width, CELLS=per_program, LANES=self.lanes,

@@ -261,7 +261,7 @@ class TotalRun(Fused):
             self.fraction, self.material, self.normals, self.law, self.law_table, self.values, self.force_in, self.load,
             self.order, self.count, self.piece_start, self.piece_node, self.piece_scene, self.pieces, self.piece_nodes,
             self.fields, partial,
-            self.schedule, self.loads.vectors, self.scenes, self.loads.tables.buffer, self.first_step, offset,
+            self.schedule, self.loads.rows, self.scenes, self.loads.buffer, self.first_step, offset,
             ny * nz, nz, *self.grid.offset, self.grid.node_count, self.grid.dx, 1 / self.grid.dx,
             self.settings.stiffness_damping,
             **options, POSITION=self.position, WIDTH=width, CELLS=per_program, LANES=self.lanes,

@@ -1,25 +1,29 @@
 """Planes and obstacles as device functions.
 
-:class:`~gaussian_swaying.mpm.colliders.Solids` makes what they read: their numbers and tables; for each solid a row of
-:data:`ROW` numbers, gap, friction and the number of its boundary; and its time window. The pose of a substep has
-:data:`POSE` numbers: place of the centre (3), rotation (9), and the velocity of what is at an offset from the centre: a
-matrix (9) and the velocity of the centre (3).
+The numbers of each solid begin with its gap, its friction and the place of its centre (3). One that moves has
+:data:`POSE` numbers of each substep: place of the centre (3), rotation (9), and the velocity of what is at an offset
+from the centre: a matrix (9) and the velocity of the centre (3).
 """
 
 from gaussian_swaying.geometry.linalg_triton import add3, dot3, matvec, read, transpose
 from gaussian_swaying.kernels.language import tl, triton
 
-ROW, POSE = tl.constexpr(4), tl.constexpr(24)
+POSE = tl.constexpr(24)
 
 
 @triton.jit
-def touch(x, row, pose, numbers, mask, SOLIDS: tl.constexpr, w: tl.constexpr, MOVES: tl.constexpr):
+def touch(x, numbers, rows, step, mask, SOLIDS: tl.constexpr, w: tl.constexpr):
     """Distance from solid w less its gap, its normal, and its velocity at places x."""
+    MOVES: tl.constexpr = SOLIDS.per_substep[w][1] > 0
+    own_numbers = numbers + SOLIDS.numbers[w][0]
+    pose = own_numbers + 2
+    if MOVES:
+        pose = rows + step * SOLIDS.width + SOLIDS.per_substep[w][0]
     x = (x[0] - tl.load(pose), x[1] - tl.load(pose + 1), x[2] - tl.load(pose + 2))
     own = x
     if MOVES:
         own = matvec(transpose(read(pose, 3, 9)), x)
-    shape = read(numbers, SOLIDS.numbers[w][0], SOLIDS.numbers[w][1])
+    shape = read(own_numbers, 5, SOLIDS.numbers[w][1] - 5)
     OPTIONS: tl.constexpr = SOLIDS.options[w]
     distance, normal = SOLIDS.functions[w](own, shape, numbers + SOLIDS.tables[w], mask, OPTIONS)
     zero = x[0] * 0
@@ -28,7 +32,7 @@ def touch(x, row, pose, numbers, mask, SOLIDS: tl.constexpr, w: tl.constexpr, MO
         normal = matvec(read(pose, 3, 9), normal)
         drive = matvec(read(pose, 12, 9), x)
         drive = (drive[0] + tl.load(pose + 21), drive[1] + tl.load(pose + 22), drive[2] + tl.load(pose + 23))
-    return distance - tl.load(row), normal, drive
+    return distance - tl.load(own_numbers), normal, drive
 
 
 @triton.jit
@@ -46,12 +50,12 @@ def stopped(v, n, kind: tl.constexpr, friction):
 
 @triton.jit
 def stop_nodes(
-    v, x, row, pose, numbers, mask, SOLIDS: tl.constexpr, w: tl.constexpr, KIND: tl.constexpr, MOVES: tl.constexpr
+    v, x, numbers, rows, step, mask, SOLIDS: tl.constexpr, w: tl.constexpr, KIND: tl.constexpr
 ):  # fmt: skip
     """Velocity of nodes at x in contact with solid w, and which of them are; KIND of ``colliders.KINDS``."""
-    friction = tl.load(row + 1)
-    distance, n, own = touch(x, row, pose, numbers, mask, SOLIDS, w, MOVES)
-    if MOVES:
+    friction = tl.load(numbers + SOLIDS.numbers[w][0] + 1)
+    distance, n, own = touch(x, numbers, rows, step, mask, SOLIDS, w)
+    if SOLIDS.per_substep[w][1] > 0:
         held = stopped(add3(v, -1.0, own), n, KIND, friction)
         held = add3(held, 1.0, own)
     else:

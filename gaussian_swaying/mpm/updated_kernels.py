@@ -37,8 +37,7 @@ from gaussian_swaying.mpm.shared_kernels import (
     vector,
     wave_speed,
 )
-from gaussian_swaying.mpm.touch import POSE, acts, stop_nodes
-from gaussian_swaying.mpm.touch import ROW as SOLID_ROW
+from gaussian_swaying.mpm.touch import acts, stop_nodes
 
 REACH = tl.constexpr(3)
 """Shuffles of a sum over neighbours: 2^REACH of them at most are added up before they are added to the grid."""
@@ -378,18 +377,16 @@ def updated_join(
 
 @triton.jit
 def _stop(
-    v, x, k, mask, step, solids, windows, pose, numbers, pin_windows, marks, room,
-    SOLIDS: tl.constexpr, w: tl.constexpr, KINDS: tl.constexpr, MOVES: tl.constexpr,
+    v, x, k, mask, step, windows, numbers, rows, marks, room,
+    SOLIDS: tl.constexpr, w: tl.constexpr, KINDS: tl.constexpr,
 ):  # fmt: skip
     """Velocity of nodes k at x held by solid w, or by pin -1 - w; which nodes it holds, and its time window."""
     if w < 0:
         held = (v[0] * 0, v[0] * 0, v[0] * 0)
         behind = tl.load(marks + (-1 - w) * room + k, mask, 0) == step + 1
-        window = pin_windows - 2 * (1 + w)
+        window = windows + 2 * (len(SOLIDS.functions) - 1 - w)
     else:
-        held, behind = stop_nodes(
-            v, x, solids + w * SOLID_ROW, pose + w * POSE, numbers, mask, SOLIDS, w, KINDS[w], MOVES[w]
-        )
+        held, behind = stop_nodes(v, x, numbers, rows, step, mask, SOLIDS, w, KINDS[w])
         window = windows + 2 * w
     return held, behind, window
 
@@ -397,21 +394,19 @@ def _stop(
 @triton.jit(do_not_specialize=VARIES)
 def updated_nodes(
     momentum, velocity, inverse_mass, occupied, nodes, schedule, first_step, step_offset,
-    gravity_x, gravity_y, gravity_z, solids, windows, poses, numbers, clock, impulse, slots, pin_windows, marks, room,
+    gravity_x, gravity_y, gravity_z, windows, numbers, rows, clock, impulse, slots, marks, room,
     ox, oy, oz, ny, nz, scene_nodes, dx,
     IMPLICIT: tl.constexpr, WIDTH: tl.constexpr, KEEP: tl.constexpr, TURNS: tl.constexpr, BOUNDARIES: tl.constexpr,
-    SOLIDS: tl.constexpr, KINDS: tl.constexpr, MOVES: tl.constexpr, MOVING: tl.constexpr, SCENES: tl.constexpr,
-    SPARSE: tl.constexpr, BLOCK: tl.constexpr,
+    SOLIDS: tl.constexpr, KINDS: tl.constexpr, SCENES: tl.constexpr, SPARSE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """``updated``: nodal velocities from momenta and masses, set back to zero unless SPARSE; KEEP for boundaries.
 
     All TURNS are applied here, in order: each is the number of a boundary, and that of one of the SOLIDS (see
-    :mod:`~gaussian_swaying.mpm.touch`), or -1 less that of a pin. KINDS and MOVES say of each solid
-    how it stops and whether it moves. With MOVING there are poses for every substep. ``marks`` (pins, room) is the last
-    substep in which each pin held a node, counted from 1. ``clock`` has the time at step 0 and the substep [s],
-    float64; ``impulse`` (programs, slots, B, 3), float64, collects the reaction impulses on nodes of the first scene of
-    a program, and of those after it. With SPARSE the velocities of programs that are not ``occupied`` stay as they are:
-    no particle is near.
+    :mod:`~gaussian_swaying.mpm.touch`), or -1 less that of a pin. KINDS says of each solid how it stops. ``marks``
+    (pins, room) is the last substep in which each pin held a node, counted from 1. ``clock`` has the time at step 0 and
+    the substep [s], float64; ``impulse`` (programs, slots, B, 3), float64, collects the reaction impulses on nodes of
+    the first scene of a program, and of those after it. With SPARSE the velocities of programs that are not
+    ``occupied`` stay as they are: no particle is near.
     """
     if SPARSE:  # noqa: SIM102  (Triton leaves out what is under a constant that is false)
         if tl.load(occupied + tl.program_id(0)) == 0:
@@ -438,9 +433,6 @@ def updated_nodes(
     )
     if len(TURNS) > 0:
         now = tl.load(clock) + step * tl.load(clock + 1)
-        pose = poses
-        if MOVING:
-            pose = poses + step * (len(SOLIDS.functions) * POSE)
         own = k
         if SCENES:
             own = k % scene_nodes
@@ -451,8 +443,8 @@ def updated_nodes(
         )
         for n in tl.static_range(len(TURNS)):
             held, behind, window = _stop(
-                v, x, k, some & mask, step, solids, windows, pose, numbers, pin_windows, marks, room,
-                SOLIDS, TURNS[n][1], KINDS, MOVES,
+                v, x, k, some & mask, step, windows, numbers, rows, marks, room,
+                SOLIDS, TURNS[n][1], KINDS,
             )  # fmt: skip
             hit = tl.where(acts(window, now), behind & some & mask, False)
             u = (tl.where(hit, held[0], v[0]), tl.where(hit, held[1], v[1]), tl.where(hit, held[2], v[2]))

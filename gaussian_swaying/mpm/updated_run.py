@@ -12,10 +12,11 @@ from torch import Tensor
 from gaussian_swaying.kernels.launch import LANES, lanes, launch, wide
 from gaussian_swaying.mpm import updated_kernels as kernels
 from gaussian_swaying.mpm.boundary import Boundary
-from gaussian_swaying.mpm.colliders import Solids, solids_of
+from gaussian_swaying.mpm.colliders import KINDS, Plane, solids_of
+from gaussian_swaying.mpm.device_functions import Packed
 from gaussian_swaying.mpm.formulation import Formulation, Held
 from gaussian_swaying.mpm.pins import PinnedRegion
-from gaussian_swaying.mpm.run import Fused, Part, check_indices
+from gaussian_swaying.mpm.run import MAX_STEPS, Fused, Part, check_indices
 from gaussian_swaying.mpm.state import GridSpec, MPMState
 
 SHARES = 16
@@ -65,13 +66,17 @@ class UpdatedRun(Fused):
         boundaries = bound.boundaries
         pins = {k: held for k, held in enumerate(bound.held) if held and _pins(boundaries[k], held)}
         parts = solids_of(boundaries, pins)
-        self.solids = Solids(parts or [], self.law_table)
+        solids = [part for part, _ in parts or []]
+        self.solids = Packed(torch.Size([1]), self.like, fixed=True)
+        self.own_solids = [found for one in solids if (found := one.device_function()) is not None]
+        self.kinds = tuple(KINDS.index(one.kind if isinstance(one, Plane) else "separate") for one in solids)
         pins = pins if parts is not None else {}
         self.pinned = [(held.mass > 0).reshape(-1).to(torch.int8) for held in pins.values()]
         """For each pin, the particles that it holds."""
-        windows = [[boundaries[k].start, boundaries[k].end] for k in pins]
-        self.windows_of_pins = torch.tensor(windows, dtype=torch.float64, device=self.device).reshape(-1)
-        turns = [(k, n) for n, (_, k) in enumerate(self.solids.parts)] + [(k, -1 - n) for n, k in enumerate(pins)]
+        windows = [one.window for one in (*solids, *(boundaries[k] for k in pins))]
+        self.windows = torch.tensor(windows, dtype=torch.float64, device=self.device).reshape(-1)
+        """First and last time of each solid, and then of each pin."""
+        turns = [(k, n) for n, (_, k) in enumerate(parts or [])] + [(k, -1 - n) for n, k in enumerate(pins)]
         self.turns = tuple(sorted(turns, key=lambda turn: turn[0]))
         """Solids and pins in order: the number of the boundary, and that of the solid, or -1 less that of the pin."""
         self.marks_of_pins = torch.zeros(len(pins), 0, dtype=torch.int32, device=self.device)
@@ -88,7 +93,7 @@ class UpdatedRun(Fused):
         many = 0 if self.atomic else self.count
         self.parts = torch.zeros(many, kernels.PART.value, **self.like)
         self.part_node = torch.zeros(many, dtype=torch.int32, device=self.device)
-        self.windows = torch.zeros(0, **self.like)
+        self.shares = torch.zeros(0, **self.like)
         self.marks, self.occupied = (torch.zeros(0, dtype=torch.int8, device=self.device) for _ in range(2))
         self.pressed = torch.zeros(0, dtype=torch.float64, device=self.device)
 
@@ -121,7 +126,7 @@ class UpdatedRun(Fused):
                 self.velocity = torch.zeros(room, 4, **self.like)
                 self.inverse_mass, self.weight = (torch.zeros(held, **self.like) for _ in range(2))
                 spans = 0 if self.atomic else -(-room // SPAN)
-                self.windows = torch.empty(SHARES * spans * SPAN * width, **self.like)
+                self.shares = torch.empty(SHARES * spans * SPAN * width, **self.like)
                 self.marks = torch.zeros(spans * SHARES, dtype=torch.int8, device=self.device)
                 self.occupied = torch.zeros(spans, dtype=torch.int8, device=self.device)
                 check_indices(len(self.pinned) * room)  # marks have a sign
@@ -145,8 +150,8 @@ class UpdatedRun(Fused):
         self.pressed.zero_()
         self.marks_of_pins.zero_()
         self.clock.copy_(torch.stack([self.time, self.dt]))
-        self.solids.take()
-        self.solids.prepare(self.time, self.dt, steps)
+        self.solids.take(self.own_solids, MAX_STEPS)
+        self.solids.begin(self.time, self.dt, steps)
         self._load(state)
         if not self.atomic:
             self._measured.copy_(self._crossing(state.velocity.double()))
@@ -293,7 +298,7 @@ class UpdatedRun(Fused):
         block = lanes(self.device, 32)
         launch(kernels.updated_particles, (-(-self.count // block),))(
             self.moving, self.order, self.load, self.count,
-            self.momentum, self.velocity, self.schedule, self.loads.vectors, self.scenes, self.loads.tables.buffer,
+            self.momentum, self.velocity, self.schedule, self.loads.rows, self.scenes, self.loads.buffer,
             self.first_step, offset, self.law_table, self.force_in, *grid.offset, *grid.resolution, grid.dx,
             1 / grid.dx, settings.stiffness_damping, self.particles, self.parts, self.part_node,
             **options, PLASTIC=self.plastic, WIDTH=self.momentum.shape[1], GATHER=gather,
@@ -307,11 +312,11 @@ class UpdatedRun(Fused):
         _, ny, nz = self.grid.resolution
         spans = -(-nodes // SPAN)
         launch(kernels.updated_scatter, (SHARES,))(
-            self.parts, self.part_node, self.windows, self.marks, self.count, spans, ny * nz, nz, dx, 1 / dx,
+            self.parts, self.part_node, self.shares, self.marks, self.count, spans, ny * nz, nz, dx, 1 / dx,
             SHARES=SHARES, SPAN=SPAN, IMPLICIT=implicit, WIDTH=width, BLOCK=LANES,
         )  # fmt: skip
         launch(kernels.updated_join, (-(-spans // CHUNK),))(
-            self.windows, self.marks, self.occupied, self.momentum, nodes, spans,
+            self.shares, self.marks, self.occupied, self.momentum, nodes, spans,
             SHARES=SHARES, SPAN=SPAN, CHUNK=CHUNK, WIDTH=width,
         )  # fmt: skip
 
@@ -328,12 +333,12 @@ class UpdatedRun(Fused):
                 )  # fmt: skip
         launch(kernels.updated_nodes, (-(-nodes // block),))(
             self.momentum, self.velocity, self.inverse_mass, self.occupied, nodes, self.schedule, self.first_step,
-            offset, *self.gravity, solids.rows, solids.windows, solids.poses, solids.tables.buffer, self.clock,
-            self.pressed, self.pressed.shape[1], self.windows_of_pins, self.marks_of_pins, self.marks_of_pins.shape[1],
+            offset, *self.gravity, self.windows, solids.buffer, solids.rows, self.clock,
+            self.pressed, self.pressed.shape[1], self.marks_of_pins, self.marks_of_pins.shape[1],
             *grid.offset, ny, nz, grid.node_count, grid.dx, IMPLICIT=options["IMPLICIT"], WIDTH=self.momentum.shape[1],
             KEEP=acting, TURNS=() if acting else self.turns, BOUNDARIES=len(self.bound.boundaries),
-            SOLIDS=solids.device_functions, KINDS=solids.kinds, MOVES=solids.moves, MOVING=any(solids.moves),
-            SCENES=self.scenes > 1, SPARSE=not (self.atomic or acting), BLOCK=block, num_warps=4,
+            SOLIDS=solids.layout, KINDS=self.kinds, SCENES=self.scenes > 1, SPARSE=not (self.atomic or acting),
+            BLOCK=block, num_warps=4,
         )  # fmt: skip
         if acting:
             self._constrain()

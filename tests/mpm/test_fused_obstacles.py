@@ -10,7 +10,7 @@ from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.geometry.rotations import rotation_from_z
 from gaussian_swaying.kernels.launch import lanes, launch
 from gaussian_swaying.mpm import contact_kernels as kernels
-from gaussian_swaying.mpm.colliders import Solids
+from gaussian_swaying.mpm.device_functions import Packed
 
 DT = 1e-3
 
@@ -22,9 +22,10 @@ def _path():
 
 def _ask_kernel(obstacle, place, time, device):
     """Gap, normal, velocity, whether it counts and whether one is within 1 cm, at places in the kernel of ``total``."""
-    solids = Solids([(obstacle.to(device), 0)], place)
-    solids.take()
-    solids.prepare(time, torch.full_like(time, DT), 1)
+    solids = Packed(torch.Size([1]), {"dtype": place.dtype, "device": place.device}, fixed=True)
+    solids.take([obstacle.to(device).device_function()], 1)
+    solids.begin(time, torch.full_like(time, DT), 1)
+    window = torch.tensor(obstacle.window, dtype=torch.float64, device=device)
     count = len(place)
     gap, valid = (torch.full((count,), -7.0, device=device) for _ in range(2))
     facing, drive = (torch.zeros(count, 3, device=device) for _ in range(2))
@@ -32,9 +33,9 @@ def _ask_kernel(obstacle, place, time, device):
     block = lanes(torch.device(device), 32)
     launch(kernels.obstacle_places, (-(-count // block),))(
         place, torch.zeros(count, 4, device=device), torch.full_like(gap, 0.02), gap, facing, drive, valid, within,
-        count, solids.rows, solids.windows, solids.poses, solids.tables.buffer, time, torch.full_like(time, DT), 0.01,
+        count, window, solids.buffer, solids.rows, time, torch.full_like(time, DT), 0.01,
         torch.zeros(1, dtype=torch.int32, device=device), 0,
-        SOLIDS=solids.device_functions, MOVES=solids.moves[0], BLOCK=block,
+        SOLIDS=solids.layout, BLOCK=block,
     )  # fmt: skip
     return gap, facing, drive, valid, int(within)
 

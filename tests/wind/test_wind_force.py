@@ -14,7 +14,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from gaussian_swaying import AeroForce, MPMSolver, SpatialWind, UniformGust, WindField, WindForce
 from gaussian_swaying._fixed import assign, changed
 from gaussian_swaying.geometry.patches import deform_patch
-from gaussian_swaying.mpm.device_functions import Composed, Tables
+from gaussian_swaying.mpm.device_functions import Packed
 from gaussian_swaying.wind.effects import CylinderObstacle, EllipsoidObstacle, LogProfile, Plume, PowerProfile
 from gaussian_swaying.wind.field import FlowKey
 from gaussian_swaying.wind.force import Places
@@ -332,23 +332,27 @@ def test_a_changed_effect_is_read_again_at_the_same_address(kernel_device):
             assign(load.wind, flows=load.wind.flows.flip(0))
         ends.append(solver.rollout(state, DT, 5, load))
         _same(ends[-1], reference.rollout(state, DT, 5, load))
-        where = where or solver.fused().loads.tables.buffer.data_ptr()
-        assert solver.fused().loads.tables.buffer.data_ptr() == where
+        where = where or solver.fused().loads.buffer.data_ptr()
+        assert solver.fused().loads.buffer.data_ptr() == where
     assert_close(ends[0].position, ends[1].position, rtol=0, atol=1e-6)
     for one, other in ((1, 2), (2, 3)):
         assert (ends[one].velocity - ends[other].velocity).abs().max() > 1e-3
 
 
+def _packed(load, device):
+    return Packed(load.area.shape, {"dtype": torch.float32, "device": torch.device(device)})
+
+
 def test_only_what_has_changed_is_written_again(kernel_device, monkeypatch):
     """A shelter is refreshed in every frame; the turbulence before it has fifty megabytes in its full size."""
     _, state, load = _setting(_wind("sheltered"), like=torch.zeros((), device=kernel_device))
-    written, tables = [], Tables(torch.device(kernel_device))
+    written, tables = [], _packed(load, kernel_device)
     plain = torch.Tensor.copy_
     monkeypatch.setattr(torch.Tensor, "copy_", lambda to, what: written.append(to.numel()) or plain(to, what))
 
     def take():
         written.clear()
-        tables.take([load.device_function()], Composed([load.device_function()]))
+        tables.take([load.device_function()], 1)
         return list(written)
 
     turbulence, shelter = [21, 8 * 6 * 4 * 3], [21, 8**3]
@@ -359,7 +363,7 @@ def test_only_what_has_changed_is_written_again(kernel_device, monkeypatch):
     load.wind.effects[0].table.mul_(2.0)
     assert take() == turbulence
     buffer = tables.buffer.clone()
-    tables = Tables(torch.device(kernel_device))
+    tables = _packed(load, kernel_device)
     assert take() == [*turbulence, *shelter]
     assert torch.equal(tables.buffer, buffer)
 

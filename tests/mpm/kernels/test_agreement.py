@@ -225,7 +225,7 @@ def test_an_obstacle_of_a_user_runs_in_torch(kernel_device):
             return distance - 0.01 * torch.sin(40 * place[..., 0]), normal
 
     def run(solver, state):
-        assert solver.transfer == "torch" or solver.fused().solids.parts == []
+        assert solver.transfer == "torch" or solver.fused().own_solids == []
         return solver.rollout(state, DT, 3)
 
     points = make_points(kernel_device, count=12)
