@@ -36,7 +36,7 @@ from .simulation.draw import Frame as Frame
 from .simulation.measure import SimulationDiverged as SimulationDiverged
 from .simulation.model import Copy as Copy
 from .simulation.model import Edit as Edit
-from .simulation.model import register as register
+from .simulation.model import Live as Live
 from .simulation.simulation import Simulation as Simulation
 from .training.data.datamodule import CaptureDataModule as CaptureDataModule
 from .training.module import SplatTrainer as SplatTrainer

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import is_dataclass
 from functools import wraps
 from itertools import count
@@ -44,12 +44,14 @@ class Fixed:
         assignable: Names that can.
         live_as: Where a simulation has it, for example ``wind``.
         of_a_file: Whether its annotations are what a file can say, and Python more.
+        live: The numbers of a force that may change between two frames, each a ``Live``.
     """
 
     __slots__ = ()
     assignable: tuple[str, ...] = ()
     live_as: str = ""
     of_a_file: bool = False
+    live: Mapping[str, Any] = {}
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -190,10 +192,9 @@ def _refuse(thing: Any, name: str) -> NoReturn:
     text = f"`{name}` of {kind.__name__} cannot be assigned, as what runs would not be what is recorded"
     given = f"{name}=..." if name in fields else ", ".join(f"{field}=..." for field in fields)
     text += f": make another {kind.__name__}({given})"
-    place = getattr(thing, "live_as", "")
-    live = {f"{place}.{name}", f"forces.{kind.__name__}.{name}"} & LIVE
-    if live:
-        number = min(live).replace("*", "0")
+    number = f"{getattr(thing, 'live_as', '')}.{name}".replace("*", "0")
+    number = f"forces.{kind.__name__}.{name}" if name in getattr(kind, "live", ()) else number
+    if number in LIVE or number.startswith("forces."):
         text += f", or between two frames `simulation.change({number!r}, ...)`"
     raise AttributeError(f"{text}.")
 

@@ -69,7 +69,7 @@ def export_live_web(arguments: Sequence[str]) -> None:
     film = write_live_web(simulation, made if splat is None else Path(splat).stem, target)
     for note in (*notes, *film.notes):
         print(f"note: {note.replace('the film', 'the page')}")
-    print(f"{film.head['count']:,} Gaussians, {simulation.setup.points.count:,} material points")
+    print(f"{film.head['count']:,} Gaussians, {simulation.model.points.count:,} material points")
     if options.element:
         write_element(target.parent)
         print(f"wrote {target.with_name(ELEMENT)}")

@@ -69,8 +69,8 @@ def _simulate(parser: ArgumentParser, arguments: Sequence[str], started: list[Si
     print(scene.frame.describe())
     if any(scene.model.origin):
         print(counted_from(scene.model.origin))
-    if simulation.setup.air is not None and isinstance(simulation.wind, WindField):
-        print(resolution(simulation.setup.air, simulation.wind, simulation.frame_dt, scene.points.position))
+    if simulation.model.air is not None and isinstance(simulation.wind, WindField):
+        print(resolution(simulation.model.air, simulation.wind, simulation.frame_dt, scene.points.position))
     extra: dict[str, Any] = {"config": [str(file) for file in settings.config or []]}
     started.append(simulation)
     with stop_signals():

@@ -216,7 +216,7 @@ def _groups(schema: type) -> dict[str, type]:
 
 
 def import_forces(files: Sequence[str | os.PathLike[str]]) -> None:
-    """Import the classes of ``forces`` in configuration files, so that the parameters that they register are known.
+    """Import the classes of ``forces`` in configuration files, so that the numbers that they name are known.
 
     Files that cannot be read and modules that cannot be imported are left to the parser, which names the error.
 

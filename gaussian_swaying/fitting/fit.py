@@ -487,8 +487,8 @@ class Fit:
 
         Other starts, and the rivals that are known of any fit, are tried over all fitted frames.
         """
-        setup, unknowns = self.simulation.setup, self.plan.unknowns
-        tried = [*map(list, rivals), *rivals_of(setup, unknowns, place)]
+        model, unknowns = self.simulation.model, self.plan.unknowns
+        tried = [*map(list, rivals), *rivals_of(model, unknowns, place)]
         if not tried:
             return [], []
         if self.moving and self.followed:
@@ -503,7 +503,7 @@ class Fit:
         for end, cost in zip(ended, costs, strict=True):
             self.say(f"rival: cost {cost:.5g}, {self._shown(end)}")
         away = [apart_by(unknowns, end, place) for end in ended]
-        most = [MIRRORED if is_mirrored(setup, unknowns, place, end) else RIVAL for end in ended]
+        most = [MIRRORED if is_mirrored(model, unknowns, place, end) else RIVAL for end in ended]
         near = [k for k, cost in enumerate(costs) if cost < most[k] * costs[0]]
         own = away.index(min(away))
         better = ended[0] if costs[own] > LOWER * costs[0] and away[0] > 2 * SAME else []

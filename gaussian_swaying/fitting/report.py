@@ -21,11 +21,11 @@ from gaussian_swaying.fitting.identifiability import Direction
 from gaussian_swaying.fitting.prepared import Judged
 from gaussian_swaying.fitting.scale import SCALE
 from gaussian_swaying.fitting.unknowns import Unknown, is_change, of_simulation, values_at
-from gaussian_swaying.fitting.variants import setup_of
+from gaussian_swaying.fitting.variants import model_of
 from gaussian_swaying.fitting.videos import Footage
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.recording.video import VideoEncoder
-from gaussian_swaying.simulation.model import POLAR, flow_of, in_settings, value_of
+from gaussian_swaying.simulation.model import POLAR, flow_of, in_settings
 from gaussian_swaying.simulation.simulation import Simulation
 
 if TYPE_CHECKING:
@@ -348,13 +348,11 @@ def scene_text(values: Mapping[str, float], parser: ArgumentParser, settings: Na
         rows = zip(wind.times.tolist(), wind.flows.tolist(), strict=True)
         found.wind.schedule = [{"time": time, "flow": [part / ratio for part in flow]} for time, flow in rows]
         found.wind.interpolation = wind.interpolation
-    for name, value in of_simulation(values).items():
-        if name not in POLAR:
-            in_settings(found, name, value)
+    in_settings(found, {name: value for name, value in of_simulation(values).items() if name not in POLAR})
     if SCALE in values:
-        setup = setup_of(simulation.setup, values)
-        for name in ("material.E", "material.density", "solver.gravity"):
-            in_settings(found, name, value_of(setup, name))
+        model = model_of(simulation.model, values)
+        scaled = ("material.E", "material.density", "solver.gravity")
+        in_settings(found, {name: model.value(name) for name in scaled})
         found.wind.flow = found.wind.flow and [part / ratio for part in found.wind.flow]
         if found.material.bending is not None:
             found.material.bending /= ratio**5

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 import torch
 
 from gaussian_swaying.fitting.unknowns import Unknown, values_at
-from gaussian_swaying.simulation.model import Setup, flow_of
+from gaussian_swaying.simulation.model import Model, flow_of
 
 SHAKEN = 0.12
 """Change of what is sought of the material, as a share of the range."""
@@ -28,11 +28,11 @@ MIRROR = 20.0
 """Largest angle between the end of another start and the mirror image of the wind that is still one [degrees]."""
 
 
-def rivals_of(setup: Setup, unknowns: Sequence[Unknown], place: Sequence[float]) -> list[list[float]]:
+def rivals_of(model: Model, unknowns: Sequence[Unknown], place: Sequence[float]) -> list[list[float]]:
     """Places from which to start again at the end of a fit, as shares of the ranges, within them.
 
     Args:
-        setup: The scene.
+        model: The scene.
         unknowns: What is sought.
         place: Where the fit ended.
 
@@ -46,7 +46,7 @@ def rivals_of(setup: Setup, unknowns: Sequence[Unknown], place: Sequence[float])
     names = [unknown.name for unknown in unknowns]
     if "wind.azimuth" in names:
         k = names.index("wind.azimuth")
-        azimuth = mirrored(setup, values_at(unknowns, place))
+        azimuth = mirrored(model, values_at(unknowns, place))
         share = unknowns[k].share(_within(azimuth, unknowns[k])) if azimuth is not None else -1.0
         if 0 <= share <= 1:
             found.append([*place[:k], share, *place[k + 1 :]])
@@ -93,7 +93,7 @@ def bent_alike(unknowns: Sequence[Unknown], place: Sequence[float]) -> list[list
     return found
 
 
-def mirrored(setup: Setup, values: Mapping[str, float]) -> float | None:
+def mirrored(model: Model, values: Mapping[str, float]) -> float | None:
     r"""Return the azimuth of the wind mirrored at the normal of a sheet at rest [degrees]; None if nothing is flat.
 
     The pressure on a sheet with normal n depends on :math:`w \cdot n` and the speed, which the mirror image
@@ -101,10 +101,10 @@ def mirrored(setup: Setup, values: Mapping[str, float]) -> float | None:
     azimuth :math:`\beta` of n.
 
     Args:
-        setup: The scene.
+        model: The scene.
         values: Values of the unknowns, with ``wind.azimuth``.
     """
-    patches = setup.scene.patches
+    patches = model.scene.patches
     normal = patches.normal.double()[:, :2]
     weight = patches.area.double() / patches.area.double().sum()
     shares, axes = torch.linalg.eigh((weight[:, None, None] * normal[:, :, None] * normal[:, None, :]).sum(0).cpu())
@@ -117,10 +117,10 @@ def mirrored(setup: Setup, values: Mapping[str, float]) -> float | None:
     return other if abs(_turned(other - azimuth)) >= TURN else None
 
 
-def is_mirrored(setup: Setup, unknowns: Sequence[Unknown], place: Sequence[float], end: Sequence[float]) -> bool:
+def is_mirrored(model: Model, unknowns: Sequence[Unknown], place: Sequence[float], end: Sequence[float]) -> bool:
     """True if the wind at the end of another start is about the mirror image of that at a place, both as shares."""
     values, there = values_at(unknowns, place), values_at(unknowns, end)
-    other = mirrored(setup, values) if "wind.azimuth" in values else None
+    other = mirrored(model, values) if "wind.azimuth" in values else None
     return other is not None and abs(_turned(there["wind.azimuth"] - other)) < MIRROR
 
 

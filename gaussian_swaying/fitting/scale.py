@@ -10,45 +10,45 @@ from __future__ import annotations
 from dataclasses import replace
 
 from gaussian_swaying._fixed import changed
-from gaussian_swaying.simulation.model import Setup, value_of, with_values
+from gaussian_swaying.simulation.model import Model
 from gaussian_swaying.wind.field import WindField
 
 SCALE = "scene.metres_per_unit"
 
 
-def at_scale(setup: Setup, metres_per_unit: float) -> Setup:
-    """A setup that moves as if a scene unit had another length.
+def at_scale(model: Model, metres_per_unit: float) -> Model:
+    """A model that moves as if a scene unit had another length.
 
     Args:
-        setup: With the values that are meant in metres.
+        model: With the values that are meant in metres.
         metres_per_unit: The length of a scene unit [m].
     """
-    wind, scene = setup.wind, setup.scene
-    gravity, sheet = value_of(setup, "solver.gravity"), not scene.filled
+    wind, scene = model.wind, model.scene
+    gravity, sheet = model.value("solver.gravity"), not scene.filled
     if not any(gravity):
         raise ValueError(f"Without gravity nothing tells `{SCALE}`: set `solver.gravity`, or measure a length.")
-    if not isinstance(wind, WindField) or len(wind.modulations) or len(wind.effects) or setup.air or setup.forces:
+    if not isinstance(wind, WindField) or len(wind.modulations) or len(wind.effects) or model.air or model.forces:
         raise ValueError(
             f"`{SCALE}` can be sought only in a plain wind: remove `wind.modulations`, `wind.effects`, `air` and "
             "`forces`, or measure a length."
         )
-    if setup.material.volume != "patch" or setup.points.count != scene.on_surface + scene.filled:
+    if model.material.volume != "patch" or model.points.count != scene.on_surface + scene.filled:
         raise ValueError(
             f"`{SCALE}` can be sought only with `material.volume: patch` and `scene.layers: 1`: set them, or measure a "
             "length."
         )
-    if setup.points.bending is not None and (isinstance(setup.material.bending, str) or setup.material.regions):
+    if model.points.bending is not None and (isinstance(model.material.bending, str) or model.material.regions):
         raise ValueError(
             f"`{SCALE}` can be sought only with one `material.bending` in N m: give it as a number and without parts, "
             "or measure a length."
         )
     ratio = metres_per_unit / scene.frame.metres_per_unit
-    changes = {"material.E": value_of(setup, "material.E") / ratio ** (3 if sheet else 2)}
+    changes = {"material.E": model.value("material.E") / ratio ** (3 if sheet else 2)}
     if sheet:
-        changes["material.density"] = value_of(setup, "material.density") / ratio
-    found = with_values(setup, changes | {"solver.gravity": [part / ratio for part in gravity]})
-    if setup.points.bending is not None:
-        found = replace(found, points=replace(found.points, bending=setup.points.bending / ratio**5))
-    if setup.aero.added_mass:
-        found = replace(found, aero=changed(setup.aero, added_mass=setup.aero.added_mass / ratio))
+        changes["material.density"] = model.value("material.density") / ratio
+    found = model.at(changes | {"solver.gravity": [part / ratio for part in gravity]})
+    if model.points.bending is not None:
+        found = replace(found, points=replace(found.points, bending=model.points.bending / ratio**5))
+    if model.aero.added_mass:
+        found = replace(found, aero=changed(model.aero, added_mass=model.aero.added_mass / ratio))
     return replace(found, wind=changed(wind, flows=wind.flows / ratio))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from gaussian_swaying._checks import check_choice
 from gaussian_swaying.fitting.scale import SCALE, at_scale
-from gaussian_swaying.simulation.model import find, names, parameter, with_values
+from gaussian_swaying.simulation.model import find, names, number
 from gaussian_swaying.simulation.simulation import Simulation
 
 SCALES = ("log", "linear")
@@ -54,7 +54,7 @@ class Unknown:
         known = find(self.name)
         own = self.name in (FILM_START, SCALE) or is_change(self.name)
         if not own and (known is None or known.kind != "number"):
-            numbers = (name for name in names() if parameter(name.replace("*", "0")).kind == "number")
+            numbers = (name for name in names() if number(name.replace("*", "0")).kind == "number")
             sought = [FILM_START, SCALE, *numbers]
             raise ValueError(f"`{self.name}` cannot be sought: use {', '.join(sought)}, or put it into `known`.")
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
@@ -62,8 +62,8 @@ class Unknown:
         if self.scale == "log" and self.low <= 0:
             raise ValueError(f"Expected `{where}.range` above 0 with `scale: log`, but got {self.low}.")
         if known is not None:
-            known.check(self.low, f"{where}.range")
-            known.check(self.high, f"{where}.range")
+            known.check(f"{where}.range", self.low)
+            known.check(f"{where}.range", self.high)
         if self.start is not None and not self.low <= self.start <= self.high:
             raise ValueError(f"Expected `{where}.start` within its range, but got {self.start}.")
 
@@ -72,7 +72,7 @@ class Unknown:
         if is_change(self.name):
             return "" if self.name.startswith(CHANGES[0]) else "degrees"
         own = {FILM_START: "s", SCALE: "m"}
-        return own[self.name] if self.name in own else parameter(self.name).unit
+        return own[self.name] if self.name in own else number(self.name).unit
 
     def value(self, share: float) -> float:
         """The value at a share of the range, 0 at ``low`` and 1 at ``high``."""
@@ -116,6 +116,6 @@ def check_unknowns(simulation: Simulation, unknowns: Sequence[Unknown]) -> None:
         if names.count(name) > 1:
             raise ValueError(f"`{name}` is in `unknowns` twice: remove one.")
     values = {unknown.name: unknown.value(0.5) for unknown in unknowns}
-    setup = with_values(simulation.setup, of_simulation(values))
+    model = simulation.model.at(of_simulation(values))
     if SCALE in values:
-        at_scale(setup, values[SCALE])
+        at_scale(model, values[SCALE])

@@ -14,7 +14,7 @@ from gaussian_swaying.fitting.scale import SCALE, at_scale
 from gaussian_swaying.fitting.unknowns import FILM_START, is_change, of_simulation
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.simulation.measure import SimulationDiverged
-from gaussian_swaying.simulation.model import Setup, parameter, with_values
+from gaussian_swaying.simulation.model import Model, number
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.simulation.step import Stepper, why_not_batched
 from gaussian_swaying.wind.field import WindField
@@ -40,7 +40,7 @@ class _Group:
 
 def check_variants(simulation: Simulation) -> None:
     """Raise ValueError if a simulation has parts that cannot be a batch: timed edits, contact, shelter, copies."""
-    why = why_not_batched(simulation.setup)
+    why = why_not_batched(simulation.model)
     if simulation.editor.edits:
         why = "`edits` change its material; put it into `material`"
     if simulation.stepper.copies is not None:
@@ -65,8 +65,8 @@ def states_of(
         alike: Take the same substeps for all, those of the stiffest, so that differences come from the values alone. If
             not, variants that need more substeps are batches of their own, and a variant may end in NaN.
     """
-    setups = [setup_of(simulation.setup, own) for own in values]
-    groups = _groups(simulation, values, setups, alike)
+    models = [model_of(simulation.model, own) for own in values]
+    groups = _groups(simulation, values, models, alike)
     before = math.ceil(max(0.0, -min(group.start for group in groups)) / simulation.frame_dt)
     for k in range(-before, 0):  # the run-up, frame by frame
         _advance(groups, k * simulation.frame_dt, (k + 1) * simulation.frame_dt, alike)
@@ -79,29 +79,29 @@ def states_of(
         yield [state for _, state in sorted(found, key=lambda pair: pair[0])]
 
 
-def setup_of(setup: Setup, values: Values) -> Setup:
-    """The setup of a variant, in a wind that changes and at another scale if its values say so."""
-    found = with_values(setup, of_simulation(values))
+def model_of(model: Model, values: Values) -> Model:
+    """The model of a variant, in a wind that changes and at another scale if its values say so."""
+    found = model.at(of_simulation(values))
     if isinstance(found.wind, WindField):
         found = replace(found, wind=changing(found.wind, values))
     return at_scale(found, values[SCALE]) if SCALE in values else found
 
 
-def _groups(simulation: Simulation, values: Sequence[Values], setups: Sequence[Setup], alike: bool) -> list[_Group]:
+def _groups(simulation: Simulation, values: Sequence[Values], models: Sequence[Model], alike: bool) -> list[_Group]:
     shared: dict[tuple[object, ...], list[int]] = {}
-    for number, (own, setup) in enumerate(zip(values, setups, strict=True)):
+    for index, (own, model) in enumerate(zip(values, models, strict=True)):
         apart = [
             (name, value)
             for name, value in sorted(own.items())
-            if name in (FILM_START, SCALE) or not (is_change(name) or parameter(name).batched)
+            if name in (FILM_START, SCALE) or not (is_change(name) or number(name).batched)
         ]
-        shared.setdefault((*apart, 0 if alike else _stiffness_class(setup)), []).append(number)
+        shared.setdefault((*apart, 0 if alike else _stiffness_class(model)), []).append(index)
     found = []
     for members in shared.values():
-        part = [setups[k] for k in members]
+        part = [models[k] for k in members]
         solver = simulation.solver.like(part[0].solver)
         assign(solver, substep=None)  # a stiffer variant may need a shorter one
-        stepper = Stepper(solver, part, simulation.frame_dt, lenient=not alike)
+        stepper = Stepper(solver, part, lenient=not alike)
         found.append(_Group(members, stepper, stepper.bind(), values[members[0]].get(FILM_START, 0.0)))
     return found
 
@@ -110,7 +110,7 @@ def _advance(groups: Sequence[_Group], begin: float, end: float, alike: bool) ->
     """Advance all groups that move from one time of the film to another [s]."""
     groups = [group for group in groups if group.moves(begin, end) > 0]
     for group in groups:
-        group.stepper.frame_dt = group.moves(begin, end)
+        group.stepper.model = group.stepper.model.replace(frame_dt=group.moves(begin, end))
     if not alike:
         for group in groups:
             try:
@@ -134,8 +134,8 @@ def _advance(groups: Sequence[_Group], begin: float, end: float, alike: bool) ->
         group.state = state
 
 
-def _stiffness_class(setup: Setup) -> int:
+def _stiffness_class(model: Model) -> int:
     """A number that is equal for materials whose fastest waves differ by less than a fifth or so."""
-    points = with_added_mass(setup.points, setup.scene.patches, setup.aero)
+    points = with_added_mass(model.points, model.scene.patches, model.aero)
     squared = (points.youngs_modulus * points.volume / points.mass).amax()
     return round(2 * math.log2(float(squared)))

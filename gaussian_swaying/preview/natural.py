@@ -85,10 +85,10 @@ def natural(simulation: Simulation, kind: Kind, flow: Tensor, intensity: float) 
     Raises:
         ValueError: If nothing holds it.
     """
-    scene, setup = simulation.scene, simulation.setup
+    scene, model = simulation.scene, simulation.model
     solver = simulation.solver
     assert isinstance(solver, MPMSolver)
-    total = Total(setup.points, solver.framed(scene.frame), setup.solver)
+    total = Total(model.points, solver.framed(scene.frame), model.solver)
     structure = Structure(total)
     place = structure.rest
     free = structure.pinned[structure.table].max(1) < 0
@@ -99,10 +99,10 @@ def natural(simulation: Simulation, kind: Kind, flow: Tensor, intensity: float) 
     along = flow if bool(flow.any()) else torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)  # it is still
     frontal = silhouette(torch.from_numpy(place[free]), along)
     moving = float(structure.point_mass[free].sum())
-    own = float(setup.points.mass.double().sum())
+    own = float(model.points.mass.double().sum())
     wanted = kind.area_mass(height) * frontal
     thicker = wanted / (own * moving)
-    found = _stiffness(structure, setup.points.youngs_modulus, own * thicker, thicker, frequency, kind)
+    found = _stiffness(structure, model.points.youngs_modulus, own * thicker, thicker, frequency, kind)
     stiffer = {value: value * ratio for value, ratio in found.items()}
     drag = _drag(simulation, frontal, along, kind)
     aero, coefficient = _with_drag(simulation.aero, drag), kind.drag
@@ -110,14 +110,14 @@ def natural(simulation: Simulation, kind: Kind, flow: Tensor, intensity: float) 
     used, leans = stiffer, bool(flow.any()) and kind not in (KINDS["hanging"], KINDS["rigid"])
     modes: Modes | None = None
     for _ in range(2):  # the second time the mode itself has the frequency; the shapes stay
-        points = setup.points
+        points = model.points
         E = points.youngs_modulus.clone()
         for value, modulus in stiffer.items():
             E[points.youngs_modulus == value] = modulus
         points = replace(points, mass=points.mass * thicker, volume=points.volume * thicker, youngs_modulus=E)
-        simulation.adopt(replace(setup, points=points, aero=aero))
+        simulation.adopt(replace(model, points=points, aero=aero))
         if used is stiffer:
-            whole = Total(points, solver.framed(scene.frame), setup.solver)
+            whole = Total(points, solver.framed(scene.frame), model.solver)
             volume, whole_mass = points.volume.double(), points.mass.double().sum()
             unit = float(whole_mass / ((points.youngs_modulus * volume).sum() / volume.sum()))
             analysis_of(whole, 0, MOST_MODES, unit * (2 * math.pi * frequency) ** 2)  # is in the cache now
@@ -163,7 +163,7 @@ def cloth_start(simulation: Simulation, kind: Kind, size: Sequence[float]) -> fl
     if kind is KINDS["cloth"]:
         carried = added_mass_per_area(sorted(size)[1], aero.air_density)
         frequency = HANGS / math.sqrt(size[2]) * math.sqrt(kind.mass / (kind.mass + carried))
-    places = simulation.setup.points.position
+    places = simulation.model.points.position
     places = places[:: max(1, len(places) // 8)]
     return typical_start(cloth_motion(wind, places, frequency, CLOTH_RATIO), frequency, tonal=False)
 
@@ -266,7 +266,7 @@ def _on_pinned_stems(structure: Structure, leaves: Any, soft: np.ndarray, target
 def _drag(simulation: Simulation, frontal: float, flow: Tensor, kind: Kind) -> float:
     """Factor on the coefficients that gives the whole the drag of its kind in a wind along a flow."""
     scene, aero = simulation.scene, simulation.aero
-    points = simulation.setup.points
+    points = simulation.model.points
     still = torch.zeros_like(points.position)
     identity = torch.eye(3).to(still).expand(*still.shape, 3)
     direction = flow.to(still) / flow.to(still).norm()

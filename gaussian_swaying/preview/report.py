@@ -401,7 +401,7 @@ def run_dict(simulation: Simulation) -> dict[str, Any]:
 
 def _air(simulation: Simulation) -> str | None:
     """Cost and resolution of the box of computed air; None without one."""
-    air, wind = simulation.stepper.setup.air, simulation.wind
+    air, wind = simulation.stepper.model.air, simulation.wind
     if air is None or not isinstance(wind, WindField):
         return None
     return str(resolution(air, wind, simulation.frame_dt, simulation.scene.points.position))

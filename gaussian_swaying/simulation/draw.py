@@ -433,7 +433,7 @@ def streaks(stepper: Stepper, state: State, camera: Camera) -> tuple[Tensor, Ten
     Returns:
         Places, scene units, shape (S, STEPS + 1, 3), and the speed at them [m/s], shape (S, STEPS + 1).
     """
-    frame, wind = stepper.scene.frame, stepper.setup.wind
+    frame, wind = stepper.scene.frame, stepper.model.wind
     device, double = state.position.device, torch.float64
     mean, centre, eye = _middle(stepper, state, camera)
     view = centre - eye
@@ -468,7 +468,7 @@ def streaks(stepper: Stepper, state: State, camera: Camera) -> tuple[Tensor, Ten
 
 def _middle(stepper: Stepper, state: State, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
     """Mean flow [m/s], centre of the object and eye [m], each of shape (3,)."""
-    device, frame, wind = state.position.device, stepper.scene.frame, stepper.setup.wind
+    device, frame, wind = state.position.device, stepper.scene.frame, stepper.model.wind
     centre = frame.point_to_sim(stepper.scene.center.to(device).double()[None])[0]
     eye = frame.point_to_sim(camera.position.to(device).double()[None])[0]
     mean = wind.mean_flow(state.time) if isinstance(wind, WindField) else in_double(stepper.flows()).mean(0)

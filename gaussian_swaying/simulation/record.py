@@ -73,7 +73,7 @@ def run_health(stepper: Stepper, log: Sequence[Mapping[str, Any]]) -> tuple[dict
         stepper: The stepper of the run.
         log: Diagnostics of its frames.
     """
-    scene, points = stepper.scene, stepper.setup.points
+    scene, points = stepper.scene, stepper.model.points
     where = scene.frame.point_to_scene(points.position.cpu().double())
     elastic = points.elastic
     size = scene.size * scene.frame.metres_per_unit
@@ -216,7 +216,7 @@ class Run:
         self.stepper, self.scene = editor.stepper, painter.scene
         if self.stepper.copies is not None:
             check_recorder(recorder)
-        if "vorticity" in recorder.renders and self.stepper.setup.air is None:
+        if "vorticity" in recorder.renders and self.stepper.model.air is None:
             raise ValueError(
                 "`recorder.renders` has `vorticity`, which only computed air has: add `air`, or remove it."
             )
@@ -435,14 +435,14 @@ class Run:
 
     def summary(self, state: State, log: list[dict[str, Any]]) -> dict[str, Any]:
         """The summary of a run; docs/runs.md describes it."""
-        stepper, scene, points = self.stepper, self.scene, self.stepper.setup.points
+        stepper, scene, points = self.stepper, self.scene, self.stepper.model.points
         moved = [entry["displacement_mean"] for entry in log]
         found, sentences = run_health(stepper, log)
         energy = [{k: entry[k] for k in ("kinetic", "elastic", "potential")} for entry in log]
         return {
             "device": describe_device(stepper.device),
             "versions": versions(),
-            "seed": getattr(stepper.setup.wind, "seed", None),
+            "seed": getattr(stepper.model.wind, "seed", None),
             "splat_sha256": self.splat,
             "particles": points.count,
             "copies": 1 if stepper.copies is None else len(stepper.copies),

@@ -62,9 +62,9 @@ from gaussian_swaying.simulation.model import (
     Edit,
     HoldLike,
     MaterialLike,
+    Model,
     Normalisation,
     SceneLike,
-    Setup,
     SolverLike,
     WindLike,
     as_camera,
@@ -74,7 +74,6 @@ from gaussian_swaying.simulation.model import (
     as_wind,
     check_types,
     resolve_device,
-    with_values,
 )
 from gaussian_swaying.simulation.record import Run
 from gaussian_swaying.simulation.step import SceneEditor, Stepper, copies_of
@@ -227,22 +226,23 @@ class Simulation(Fixed):
             part.region for part in (*solver.boundaries, *edits) if isinstance(getattr(part, "region", None), Region)
         ]
         fixed, kind = bool(solver.neighbours_fixed), getattr(torch, dtype)
-        model = SimulatedScene(settings, material, solver.dx, kind, cloud, fixed, apart, solver.embedded)
+        seen = SimulatedScene(settings, material, solver.dx, kind, cloud, fixed, apart, solver.embedded)
         if contact is not None and not fixed:
             raise ValueError(
                 "`contact` needs `solver.formulation: total`: leave it out, as in `updated` material meets on the grid."
             )
         obstacles = [part for part in solver.boundaries if isinstance(part, Obstacle)]
-        model.take_contact(contact, obstacles)
-        blowing = as_wind(wind, model.frame)
-        camera = as_camera(camera, cameras, blowing, model)
-        own = tuple(force.in_frame(model.frame) for force in as_forces(forces))
-        setup = Setup(model, material, model.points, blowing, aero or AeroForce(), own, solver.settings, air)
+        seen.take_contact(contact, obstacles)
+        blowing = as_wind(wind, seen.frame)
+        camera = as_camera(camera, cameras, blowing, seen)
+        own = tuple(force.in_frame(seen.frame) for force in as_forces(forces))
+        aero = aero or AeroForce()
+        model = Model(seen, material, seen.points, blowing, aero, own, solver.settings, air, float(frame_dt))
         wait_for_device()
-        placed = copies_of(copies, setup, solver) if copies else None
+        placed = copies_of(copies, model, solver) if copies else None
         drawing = (shader, camera, cameras, colour, frame_dt, renderer)
-        self._painter = Painter(model, *drawing) if placed is None else CopiesPainter(model, placed, *drawing)
-        self._stepper = Stepper(solver, setup, float(frame_dt), turn=self._painter.turn, copies=placed)
+        self._painter = Painter(seen, *drawing) if placed is None else CopiesPainter(seen, placed, *drawing)
+        self._stepper = Stepper(solver, model, turn=self._painter.turn, copies=placed)
         self.to(target)
         self._editor = SceneEditor(self._stepper, edits)
         self._recorder = self._recorder_or(recorder)
@@ -303,52 +303,52 @@ class Simulation(Fixed):
 
     def to(self, device: torch.device | str) -> Self:
         """Move all components to a device; returns the simulation."""
-        setup, solver = self.setup, self.solver
-        for part in (self._painter, solver, setup.wind, setup.aero, *setup.forces):
+        model, solver = self.model, self.solver
+        for part in (self._painter, solver, model.wind, model.aero, *model.forces):
             part.to(device)
-        self._stepper.take(replace(setup, points=self.scene.points))
+        self._stepper.take(model.replace(points=self.scene.points))
         return self
 
     # ---- numbers that may change
 
     @property
-    def setup(self) -> Setup:
+    def model(self) -> Model:
         """The present scene, material and drivers; see :mod:`gaussian_swaying.simulation.model`."""
-        return self._stepper.setup
+        return self._stepper.model
 
     @property
     def material(self) -> Material:
         """The material, without edits."""
-        return self.setup.material
+        return self.model.material
 
     @property
     def wind(self) -> WindField | SpatialWind:
         """The wind; it may be assigned between two frames, also as three numbers [m/s]."""
-        return self.setup.wind
+        return self.model.wind
 
     @wind.setter
     def wind(self, wind: WindLike | None) -> None:
         check_types({"wind": wind})
-        self.adopt(replace(self.setup, wind=as_wind(wind, self.scene.frame)))
+        self.adopt(self.model.replace(wind=as_wind(wind, self.scene.frame)))
 
     @property
     def aero(self) -> AeroForce:
         """Force of the wind on patches; it may be assigned between two frames."""
-        return self.setup.aero
+        return self.model.aero
 
     @aero.setter
     def aero(self, aero: AeroForce | None) -> None:
         check_types({"aero": aero})
-        self.adopt(replace(self.setup, aero=aero or AeroForce()))
+        self.adopt(self.model.replace(aero=aero or AeroForce()))
 
     @property
     def custom_forces(self) -> tuple[Force, ...]:
         """Forces besides gravity and wind; they may be assigned between two frames."""
-        return self.setup.forces
+        return self.model.forces
 
     @custom_forces.setter
     def custom_forces(self, forces: Sequence[Force]) -> None:
-        self.adopt(replace(self.setup, forces=tuple(as_forces(forces))))
+        self.adopt(self.model.replace(forces=tuple(as_forces(forces))))
 
     @property
     def forces(self) -> list[Force]:
@@ -358,12 +358,11 @@ class Simulation(Fixed):
     @property
     def frame_dt(self) -> float:
         """Time between frames [s]; it may be assigned between two frames."""
-        return self._stepper.frame_dt
+        return self.model.frame_dt
 
     @frame_dt.setter
     def frame_dt(self, frame_dt: float) -> None:
-        check_positive("frame_dt", frame_dt)
-        self._stepper.frame_dt = self._painter.frame_dt = float(frame_dt)
+        self.change("frame_dt", frame_dt)
 
     @property
     def recorder(self) -> Recorder:
@@ -394,29 +393,30 @@ class Simulation(Fixed):
             ValueError: If there is no such parameter, a value is out of range, or the simulation has no place for it;
                 everything then stays as it was.
         """
-        self.adopt(with_values(self.setup, {name: value} if isinstance(name, str) else name))
+        self.adopt(self.model.at(name, value))
 
     @in_turn
-    def adopt(self, setup: Setup) -> None:
-        """As :meth:`change`, with a setup."""
-        before, editor = self.setup, self._editor
-        if setup.points is not before.points and editor.edits:
+    def adopt(self, model: Model) -> None:
+        """As :meth:`change`, with a model."""
+        before, editor = self.model, self._editor
+        if model.points is not before.points and editor.edits:
             raise ValueError("`edits` give the material of parts of the object: change it there, not everywhere.")
         try:
-            self._adopt(setup)
+            self._adopt(model)
         except Exception:
             self._adopt(before)
             raise
 
-    def _adopt(self, setup: Setup) -> None:
-        before = self.setup
+    def _adopt(self, model: Model) -> None:
+        before = self.model
         with torch.inference_mode(False):
-            for part in (setup.wind, setup.aero, *setup.forces):
+            for part in (model.wind, model.aero, *model.forces):
                 part.to(self.device)
-            if setup.points is not before.points:
-                self.scene.points = setup.points
-                self._editor.rebase(setup.points)
-            self._stepper.take(setup, running=self._stepper.starts > 0)
+            if model.points is not before.points:
+                self.scene.points = model.points
+                self._editor.rebase(model.points)
+            self._painter.frame_dt = model.frame_dt
+            self._stepper.take(model, running=self._stepper.starts > 0)
 
     def variant(self, values: Mapping[str, Any], recorder: Recorder | None = None, config: str = "") -> Simulation:
         """Another simulation of the same scene with other numbers; it shares Gaussians, cameras and pins.
@@ -430,12 +430,12 @@ class Simulation(Fixed):
             ValueError: As :meth:`change`.
         """
         points, sh0, shN = self._editor.unedited
-        other, setup = copy.copy(self), with_values(replace(self.setup, points=points), values)
-        solver = self.solver.like(setup.solver)
-        scene = changed(self.scene, points=setup.points, model=changed(self.scene.model, sh0=sh0, shN=shN))
+        other, model = copy.copy(self), self.model.replace(points=points).at(values)
+        solver = self.solver.like(model.solver)
+        scene = changed(self.scene, points=model.points, model=changed(self.scene.model, sh0=sh0, shN=shN))
         other._painter = changed(self._painter, scene=scene)
-        setup = replace(setup, scene=scene, wind=setup.wind.to(self.device))
-        other._stepper = Stepper(solver, setup, self.frame_dt, turn=self.turn, copies=self._stepper.copies)
+        model = model.replace(scene=scene, wind=model.wind.to(self.device))
+        other._stepper = Stepper(solver, model, turn=self.turn, copies=self._stepper.copies)
         other._editor = SceneEditor(other._stepper, self._editor.edits)
         other._recorder, other._files = self._recorder_or(recorder), []
         other.config = config
@@ -443,10 +443,10 @@ class Simulation(Fixed):
 
     def _running(self) -> dict[str, tuple[object, list[object]]]:
         """What runs now by its names: each with the objects and versions of tensors that change if it does."""
-        setup, painter = self.setup, self._painter
-        parts = {name: getattr(setup, name) for name in ("material", "wind", "aero", "forces", "air")}
+        model, painter = self.model, self._painter
+        parts = {name: getattr(model, name) for name in ("material", "wind", "aero", "forces", "air", "frame_dt")}
         parts |= {name: getattr(painter, name) for name in ("shader", "camera", "cameras", "background")}
-        parts |= {"solver": self.solver, "frame_dt": self._stepper.frame_dt}
+        parts["solver"] = self.solver
         found: dict[str, tuple[object, list[object]]] = {}
         for name, part in parts.items():
             held = list(part.items()) if isinstance(part, dict) else [part]
@@ -454,7 +454,7 @@ class Simulation(Fixed):
             tensors = (
                 [part] if isinstance(part, Tensor) else tensors_in(one for one in held if isinstance(one, nn.Module))
             )
-            marks = [*held, *([setup.solver] if name == "solver" else [])]
+            marks = [*held, *([model.solver] if name == "solver" else [])]
             found[name] = part, [*marks, *(0 if one.is_inference() else one._version for one in tensors)]
         return found
 
@@ -627,8 +627,8 @@ def batch_of(members: Sequence[Simulation]) -> Stepper:
         raise ValueError("These cannot be simulated as a batch: they have `copies`, which are one already.")
     if any(member.editor.edits for member in members):
         raise ValueError("These cannot be simulated as a batch: they have `edits`; put their material into `material`.")
-    solver = first.solver.like(first.setup.solver)
-    return Stepper(solver, [member.setup for member in members], first.frame_dt, turn=first.turn)
+    solver = first.solver.like(first.model.solver)
+    return Stepper(solver, [member.model for member in members], turn=first.turn)
 
 
 @torch.inference_mode()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import operator
 import warnings
@@ -40,7 +39,7 @@ from gaussian_swaying.simulation.measure import (
     check_spacing,
     measure,
 )
-from gaussian_swaying.simulation.model import Copy, Edit, Setup, edited_points, recolored
+from gaussian_swaying.simulation.model import Copy, Edit, Model, edited_points, recolored
 from gaussian_swaying.wind.computed_air import AirInBox
 from gaussian_swaying.wind.field import WindField
 from gaussian_swaying.wind.force import AirLift, Places, Wind, WindForce, carried_mass, with_added_mass
@@ -104,27 +103,27 @@ class Copies(nn.Module):
         return found
 
 
-def copies_of(copies: Sequence[Copy], setup: Setup, solver: Solver) -> Copies:
+def copies_of(copies: Sequence[Copy], model: Model, solver: Solver) -> Copies:
     """The copies of the object of a simulation.
 
     Args:
         copies: The copies.
-        setup: Scene, material and drivers of the object.
+        model: Scene, material and drivers of the object.
         solver: Its solver.
     """
-    why = _why_not(copies, setup, solver)
+    why = _why_not(copies, model, solver)
     if why is not None:
         raise ValueError(why)
-    return Copies(copies, setup.scene, solver.boundaries)
+    return Copies(copies, model.scene, solver.boundaries)
 
 
-def _why_not(copies: Sequence[Copy], setup: Setup, solver: Solver) -> str | None:
-    wind = setup.wind
-    if setup.air is not None:
+def _why_not(copies: Sequence[Copy], model: Model, solver: Solver) -> str | None:
+    wind = model.wind
+    if model.air is not None:
         return "`copies` cannot have computed air yet, which belongs to one object: set `air` to null."
-    if setup.scene.surface_places is not None:
+    if model.scene.surface_places is not None:
         return "`copies` cannot touch anything yet: set `contact` to null, and remove obstacles from the solver."
-    if setup.forces:
+    if model.forces:
         return "`copies` cannot have `forces` yet, as these act on one object: remove them."
     if isinstance(wind, WindField) and any(isinstance(effect, Shelter) for effect in wind.effects):
         return "`copies` cannot have a Shelter yet, which belongs to one object: remove it from `wind.effects`."
@@ -194,41 +193,39 @@ class Stepper:
 
     Args:
         solver: The solver.
-        setups: Scene, material and drivers; or those of each scene of a batch.
-        frame_dt: Length of a frame [s].
+        models: Scene, material and drivers; or those of each scene of a batch.
         turn: Lock of the thread that steps; its own if None.
         copies: Copies of the one scene, which are then the scenes of a batch; None for the scene alone.
         lenient: Whether a scene of a batch may diverge: it then ends in NaN, and the others go on.
 
     Attributes:
-        setup: Scene, material and drivers; those of the first scene of a batch, without the places of copies.
-        setups: The setups of all scenes now; :meth:`take` changes them.
+        model: Scene, material and drivers; those of the first scene of a batch, without the places of copies.
+        models: The models of all scenes now; :meth:`take` changes them.
         starts: How often it was started.
         lift: Takes the weight of carried air off the points (``aero.added_mass``); None if there is none.
         progress: Shows how far a frame is, if there is one.
         most_substeps: A frame that needs more ends the run.
 
     Raises:
-        ValueError: If the setups cannot be a batch, see :func:`why_not_batched`.
+        ValueError: If the models cannot be a batch, see :func:`why_not_batched`.
     """
 
     def __init__(
         self,
         solver: Solver,
-        setups: Setup | Sequence[Setup],
-        frame_dt: float,
+        models: Model | Sequence[Model],
         *,
         turn: Turn | None = None,
         copies: Copies | None = None,
         lenient: bool = False,
     ) -> None:
-        self.batched, self.copies = copies is not None or not isinstance(setups, Setup), copies
-        self.setup = setups if isinstance(setups, Setup) else setups[0]
-        self.setups = self._spread(setups) if isinstance(setups, Setup) else tuple(setups)
-        reasons = [why for setup in self.setups if self.batched and (why := why_not_batched(setup)) is not None]
+        self.batched, self.copies = copies is not None or not isinstance(models, Model), copies
+        self.model = models if isinstance(models, Model) else models[0]
+        self.models = self._spread(models) if isinstance(models, Model) else tuple(models)
+        reasons = [why for model in self.models if self.batched and (why := why_not_batched(model)) is not None]
         if reasons:
             raise ValueError(f"These cannot be simulated as a batch: {reasons[0]}.")
-        self.solver, self.frame_dt, self.lenient, self.turn = solver, frame_dt, lenient, turn or Turn()
+        self.solver, self.lenient, self.turn = solver, lenient, turn or Turn()
         self.most_substeps, self.starts = MAX_SUBSTEPS, 0
         self.outlook: Outlook | None = None  # on the next frame
         self.progress: RunProgress | None = None  # of the current run
@@ -245,13 +242,18 @@ class Stepper:
 
     # ---- what acts
 
-    def _spread(self, setup: Setup) -> tuple[Setup, ...]:
-        return (setup,) * (1 if self.copies is None else len(self.copies))
+    def _spread(self, model: Model) -> tuple[Model, ...]:
+        return (model,) * (1 if self.copies is None else len(self.copies))
 
     @property
     def scene(self) -> SimulatedScene:
         """Gaussians, material points and patches."""
-        return self.setup.scene
+        return self.model.scene
+
+    @property
+    def frame_dt(self) -> float:
+        """Length of a frame [s]."""
+        return self.model.frame_dt
 
     @property
     def device(self) -> torch.device:
@@ -260,8 +262,8 @@ class Stepper:
     @property
     def wind_force(self) -> WindForce:
         """The wind on the patches of the scene, or of all scenes."""
-        first = self.setups[0]
-        parts = (first.aero, first.scene.patches, *(setup.wind for setup in self.setups))
+        first = self.models[0]
+        parts = (first.aero, first.scene.patches, *(model.wind for model in self.models))
         if self._wind_force is None or any(a is not b for a, b in zip(self._wind_force[0], parts, strict=True)):
             with torch.inference_mode(False), torch.no_grad():  # it outlives the call
                 self._wind_force = parts, self._wind_on()
@@ -269,7 +271,7 @@ class Stepper:
 
     def _wind_on(self) -> WindForce:
         """The wind on the patches of all scenes, computed together where it can be."""
-        first, winds, places = self.setups[0], [setup.wind for setup in self.setups], None
+        first, winds, places = self.models[0], [model.wind for model in self.models], None
         alone = WindForce(first.aero, first.wind, first.scene.patches)
         if not self.batched:
             return alone
@@ -282,10 +284,10 @@ class Stepper:
 
     @property
     def materials(self) -> tuple[MaterialPoints, ...]:
-        """The material of each scene as the solver gets it: that of its setup, with the air that it carries."""
+        """The material of each scene as the solver gets it: that of its model, with the air that it carries."""
         known, self._materials, found = self._materials, {}, []
-        for setup in self.setups:
-            points, patches, aero = setup.points, setup.scene.patches, setup.aero
+        for model in self.models:
+            points, patches, aero = model.points, model.scene.patches, model.aero
             if aero.carried == 0:
                 found.append(points)
                 continue
@@ -317,7 +319,7 @@ class Stepper:
     @property
     def idle(self) -> bool:
         """True if the wind has no effect; computed again only if a coefficient changed, as it makes the host wait."""
-        aero = self.setup.aero
+        aero = self.model.aero
         key = (aero, aero.air_density, *(0 if c.is_inference() else c._version for c in (aero.C_D, aero.C_F, aero.C_L)))
         if self._idle is None or self._idle[0] != key:
             self._idle = (key, aero.idle)
@@ -329,8 +331,8 @@ class Stepper:
 
         The lift of carried air is one of them. The force of computed air is not among them; :meth:`roll` adds it.
         """
-        custom = [*([] if self.lift is None else [self.lift]), *self.joints, *self.setup.forces]
-        return custom if self.idle or self.setup.air is not None else [self.wind_force, *custom]
+        custom = [*([] if self.lift is None else [self.lift]), *self.joints, *self.model.forces]
+        return custom if self.idle or self.model.air is not None else [self.wind_force, *custom]
 
     @property
     def air(self) -> AirInBox | None:
@@ -353,12 +355,12 @@ class Stepper:
 
     def flows(self) -> Tensor:
         """Flows of the wind without gusts [m/s], shape (K, 3); those of a spatial wind are at the particles."""
-        winds = [setup.wind for setup in (self.setups if self.copies is None else [self.setup])]
+        winds = [model.wind for model in (self.models if self.copies is None else [self.model])]
         flows = [wind.flows for wind in winds if isinstance(wind, WindField)]
         if len(flows) == len(winds):
             return torch.cat(flows)
-        position = self.setup.points.position
-        position = position.expand(len(self.setups), *position.shape) if self.batched else position
+        position = self.model.points.position
+        position = position.expand(len(self.models), *position.shape) if self.batched else position
         air = self.wind_force.air(torch.zeros((), dtype=torch.float64, device=position.device), position)
         return air.reshape(-1, 3)
 
@@ -372,12 +374,12 @@ class Stepper:
         normal, area = deform_patch(F, scene.rest_facing.to(F), F.new_ones(len(F)))
         place = scene.frame.point_to_sim(in_double(scene.model.means[scene.moving])).to(move) + move
         wind = self.air_at(state, place)
-        force = self.setup.aero(wind, scene.follow.velocity(state), normal, torch.ones_like(area))
+        force = self.model.aero(wind, scene.follow.velocity(state), normal, torch.ones_like(area))
         return scene.on_gaussians(torch.where(scene.in_wind, torch.linalg.vector_norm(force, dim=-1), 0.0))
 
     def force_scale(self) -> float:
         """Force per area [Pa] that the wind's flow, without gusts, can exert on a patch at rest; 1 in still air."""
-        aero = self.setup.aero
+        aero = self.model.aero
         speed = float(torch.linalg.vector_norm(self.flows().detach(), dim=-1).amax())
         coefficients = float(torch.stack([aero.C_D, aero.C_F, aero.C_L]).detach().abs().sum())
         return 0.5 * aero.air_density * speed**2 * coefficients or 1.0
@@ -413,22 +415,22 @@ class Stepper:
         return state
 
     def _with_air(self, state: State) -> State:
-        setup = self.setup
-        if setup.air is None:
+        model = self.model
+        if model.air is None:
             self._air = None
             return state
         with torch.inference_mode(False), torch.no_grad():
             still = None
-            if setup.air.still_walls:
-                low, high = (torch.tensor(corner, dtype=torch.float64) for corner in (setup.air.low, setup.air.high))
-                still = setup.scene.still_distance(low, high, 2 * setup.air.cells)
+            if model.air.still_walls:
+                low, high = (torch.tensor(corner, dtype=torch.float64) for corner in (model.air.low, model.air.high))
+                still = model.scene.still_distance(low, high, 2 * model.air.cells)
             self._air = AirInBox(
-                setup.air, self.wind_force, self.solver, setup.scene.frame, self.frame_dt, state, still
+                model.air, self.wind_force, self.solver, model.scene.frame, self.frame_dt, state, still
             )
             return state.replace(air=self._air.start(state.time))
 
     def rehearse(self) -> None:
-        """Raise the errors that a start with the present setup would raise."""
+        """Raise the errors that a start with the present model would raise."""
         rehearsed = self.bind()
         self.solver.prepare()
         self.solver.substeps(rehearsed, self.frame_dt)
@@ -444,9 +446,9 @@ class Stepper:
                 self.solver.rule_out_modes(why)
                 state = self.solver.init_state(points, frame=scene.frame, surface=scene.surface_places)
         self.lift = None
-        if any(setup.aero.carried for setup in self.setups) and any(self.solver.gravity):
+        if any(model.aero.carried for model in self.models) and any(self.solver.gravity):
             with torch.inference_mode(False), torch.no_grad():  # it outlives the call
-                air = [carried_mass(setup.scene.patches, setup.aero) for setup in self.setups]
+                air = [carried_mass(model.scene.patches, model.aero) for model in self.models]
                 mass = torch.stack(air) if self.batched else air[0]
                 self.lift = AirLift(mass.to(points.mass), self.solver.gravity)
         return state
@@ -462,9 +464,9 @@ class Stepper:
 
     def _lean(self, bound: Modes) -> float:
         """Mean displacement of the tenth that moves most in the strongest steady wind, over the longest side."""
-        first, flows = self.setup, self.flows().detach()
+        first, flows = self.model, self.flows().detach()
         strongest = WindField(flows[flows.norm(dim=-1).argmax()])
-        state = bound.leaning(WindForce(first.aero, strongest, _repeated(first.scene.patches, len(self.setups))))
+        state = bound.leaning(WindForce(first.aero, strongest, _repeated(first.scene.patches, len(self.models))))
         rest = bound.points.position
         side = (rest.amax(-2) - rest.amin(-2)).amax()
         moved = (state.position - rest).norm(dim=-1).flatten()
@@ -487,21 +489,21 @@ class Stepper:
     # ---- other values
 
     @in_turn
-    def take(self, setup: Setup, running: bool = False) -> State | None:
+    def take(self, model: Model, running: bool = False) -> State | None:
         """Go on with another material, wind or forces; the solver is bound again only if its part has changed.
 
         Args:
-            setup: The new setup, of the one scene.
+            model: The new model, of the one scene.
             running: Whether there is a state from which to go on; else the next start binds the solver.
 
         Returns:
             The state at rest if the solver was bound again.
         """
-        before, self.setup, self.setups = self.setup, setup, self._spread(setup)
-        if setup.solver is not before.solver:
-            assign(self.solver, settings=setup.solver)
-        kept = len(self._bound) == len(self.setups) and all(map(operator.is_, self._bound, self.materials))
-        if not running or (kept and setup.solver is before.solver):
+        before, self.model, self.models = self.model, model, self._spread(model)
+        if model.solver is not before.solver:
+            assign(self.solver, settings=model.solver)
+        kept = len(self._bound) == len(self.models) and all(map(operator.is_, self._bound, self.materials))
+        if not running or (kept and model.solver is before.solver):
             return None
         rest = self.bind()
         self.solver.prepare()
@@ -605,14 +607,14 @@ class Stepper:
             return self._steps  # of the frame before, as one of the scenes has diverged
         steps = self.solver.substeps(state, self.frame_dt, cells)
         if not (math.isfinite(rate) and blowing < MAX_WIND):
-            aero = self.setup.aero
+            aero = self.model.aero
             bad = [name for name in ("C_D", "C_F", "C_L") if not bool(getattr(aero, name).isfinite())]
             if bad:
                 value = float(getattr(aero, bad[0]).detach())
                 self.give_up(state, f"`aero.{bad[0]}` is {value:g}", "set it to a finite number")
             cause = f"the wind of {blowing:.3g} m/s, or its drag, is NaN or infinite or beyond {MAX_WIND:g} m/s"
             self.give_up(state, cause, "check the flow and the modulations of the wind")
-        explicit = self.setup.aero.drag_step != "semi_implicit" and self.setup.air is None
+        explicit = self.model.aero.drag_step != "semi_implicit" and self.model.air is None
         self._steps = max(steps, int(rate * self.frame_dt) + 1) if explicit else steps
         if self._air is not None:
             self._steps = -(-self._steps // self._air.steps) * self._air.steps
@@ -782,18 +784,18 @@ def needs_of(stepper: Stepper, state: State, winds: Tensor | None) -> Tensor:
         return torch.stack([cells, *cells.new_zeros(2)])
     wind = torch.linalg.vector_norm(winds, dim=-1).amax().to(state.velocity.dtype)
     speed = wind + torch.linalg.vector_norm(state.velocity, dim=-1)
-    fastest = stepper.setup.aero.rate(speed, stepper.wind_force.area, stepper.solver.points.mass).amax()
+    fastest = stepper.model.aero.rate(speed, stepper.wind_force.area, stepper.solver.points.mass).amax()
     return torch.stack([cells, in_double(fastest), in_double(wind)])
 
 
-def why_not_batched(setup: Setup) -> str | None:
+def why_not_batched(model: Model) -> str | None:
     """Return the reason why a scene cannot be one of a batch; None if it can."""
-    wind = setup.wind
-    if setup.air is not None:
+    wind = model.wind
+    if model.air is not None:
         return "the air is computed for one scene at a time; set `air` to null"
     if isinstance(wind, WindField) and any(isinstance(effect, Shelter) for effect in wind.effects):
         return "the wind has a Shelter, which depends on the motion of one scene; remove it from `wind.effects`"
-    if setup.scene.surface_places is not None:
+    if model.scene.surface_places is not None:
         return "the object touches itself or an obstacle; set `contact` to null, and remove the obstacles"
     return None
 
@@ -906,7 +908,7 @@ class SceneEditor:
 
     def _pass_on(self, running: bool = False) -> State | None:
         """Give the material of the scene to the stepper."""
-        return self.stepper.take(dataclasses.replace(self.stepper.setup, points=self.scene.points), running)
+        return self.stepper.take(self.stepper.model.replace(points=self.scene.points), running)
 
     # ---- the scene
 

@@ -14,7 +14,7 @@ from gaussian_swaying._files import sha256
 from gaussian_swaying._inputs import check_regular
 from gaussian_swaying._yaml_limits import read_fields
 from gaussian_swaying.config.parser import check_settings, config_text, option, parse_text
-from gaussian_swaying.simulation.model import POLAR, all_in_settings
+from gaussian_swaying.simulation.model import POLAR, in_settings
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.axes import read_axis, runs_of
 
@@ -137,7 +137,7 @@ def parse_run(parser: ArgumentParser, config: str, frames: int, run: Mapping[str
     own = {n: v for n, v in run.items() if n in POLAR or n.startswith(("forces.", "wind.modulations."))}
     options = [option(name, value) for name, value in {"frames": frames, **run}.items() if name not in own]
     settings = parse_text(parser, config, options)
-    all_in_settings(settings, own)
+    in_settings(settings, own)
     check_settings(Simulation, settings)
     return settings
 

@@ -72,8 +72,7 @@ def members_of(job: Job, parser: ArgumentParser) -> tuple[list[Simulation], int]
     for run in job.runs[1:]:  # parsing takes longer than a frame of all
         settings.append(settings[0].clone())
         changes.append({name: value for name, value in run.items() if shares_rollout(name)})
-        for name, value in changes[-1].items():
-            in_settings(settings[-1], name, value)
+        in_settings(settings[-1], changes[-1])
     first = Simulation.from_settings(parser, settings[0])
     first.start()  # with all checks of a run
     written = texts(parser, settings, [name for name in job.runs[0] if shares_rollout(name)])

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 import torch
 import yaml
 
-from gaussian_swaying.simulation.model import POLAR, all_in_settings, find, of_settings, parameter
+from gaussian_swaying.simulation.model import POLAR, find, in_settings, number, of_settings
 from gaussian_swaying.simulation.simulation import Simulation
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
-PICTURE = ("shader", "background", "frame_dt")
-"""Fields besides the parameters that change in motion."""
+PICTURE = ("shader", "background")
+"""Fields besides the numbers that change in motion."""
 
 SHADER = "shader.init_args."
 
@@ -47,7 +47,7 @@ def changed_settings(parser: ArgumentParser, settings: Namespace, values: Mappin
         settings = copy.deepcopy(settings)
     for name, value in shader.items():
         settings[name] = value
-    all_in_settings(settings, numbers)
+    in_settings(settings, numbers)
     return settings
 
 
@@ -70,11 +70,11 @@ def take(simulation: Simulation, parser: ArgumentParser, settings: Namespace, na
     heads = {name.split(".")[0] for name in names if find(name) is None}
     if not heads <= {"wind", "aero", *PICTURE}:
         return False
-    if "frame_dt" in heads and simulation.setup.air is not None:
+    if "frame_dt" in numbers and simulation.model.air is not None:
         return False  # computed air has one length of the frame
     if any(name.startswith("material.") for name in numbers) and (simulation.material.regions or settings.edits):
         return False  # each part has its own
-    if not all(parameter(name).same_points for name in numbers):
+    if not all(number(name).same_points for name in numbers):
         return False
     if settings.wind.schedule is not None or heads & {"wind", "aero"}:  # as a whole
         heads |= {name.split(".")[0] for name in numbers} & {"wind", "aero"}
@@ -92,6 +92,4 @@ def take(simulation: Simulation, parser: ArgumentParser, settings: Namespace, na
         painter.shader = None if parts["shader"] is None else parts["shader"].to(simulation.device)
     if "background" in heads:
         painter.background = torch.tensor(parts["background"], dtype=torch.float32, device=simulation.device)
-    if "frame_dt" in heads:
-        simulation.frame_dt = float(settings.frame_dt)
     return True

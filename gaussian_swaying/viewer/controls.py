@@ -12,7 +12,7 @@ import torch
 from gaussian_swaying.mpm.materials import MATERIALS, name_of
 from gaussian_swaying.rendering.passes import colormap
 from gaussian_swaying.simulation.draw import speed_scale
-from gaussian_swaying.simulation.model import POLAR, angles_of, flow_of, parameter, present, value_of
+from gaussian_swaying.simulation.model import POLAR, angles_of, flow_of, number
 from gaussian_swaying.viewer.files import Files
 from gaussian_swaying.viewer.gusts import Gusts
 from gaussian_swaying.viewer.holding import Holding
@@ -123,18 +123,18 @@ class Controls(Panel):
 
     def _forces(self) -> None:
         self.forces: dict[str, Any] = {}
-        setup = self.session.simulation.setup
-        for name in present(setup, "forces."):
+        model = self.session.simulation.model
+        for name in model.numbers("forces."):
             if not self.forces:
                 folder = self.server.gui.add_folder("Forces")
-            known = parameter(name)
+            known = number(name)
             label = name.removeprefix("forces.") + (f" [{known.unit}]" if known.unit else "")
             low, high = (None if math.isinf(end) else end for end in (known.low, known.high))
             with folder:
-                number = self.forces[name] = self.server.gui.add_number(
-                    label, value_of(setup, name), min=low, max=high, step=0.01
+                control = self.forces[name] = self.server.gui.add_number(
+                    label, model.value(name), min=low, max=high, step=0.01
                 )
-            self.on(number.on_update, lambda name=name, number=number: self._set(name, number.value))
+            self.on(control.on_update, lambda name=name, control=control: self._set(name, control.value))
 
     def _picture(self) -> None:
         gui = self.server.gui
@@ -206,8 +206,8 @@ class Controls(Panel):
             (self.light, self._light_azimuth()),
             (self.shading, self.session.simulation.painter.shader is not None),
         ]
-        setup = self.session.simulation.setup
-        shown += [(control, value_of(setup, name)) for name, control in self.forces.items() if present(setup, name)]
+        model = self.session.simulation.model
+        shown += [(control, model.value(name)) for name, control in self.forces.items() if model.numbers(name)]
         for control, value in shown:
             control.value = value
         self.draw_handles()

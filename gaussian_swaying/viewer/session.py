@@ -315,7 +315,7 @@ class Session:
                 return
         self._publish(state, health)
         took, wanted = time.perf_counter() - began, float(self.settings.frame_dt)
-        shortest = wanted if simulation.setup.air is not None else wanted / SHORTEST  # computed air has one length
+        shortest = wanted if simulation.model.air is not None else wanted / SHORTEST  # computed air has one length
         if took > SLOW and health.substeps > FEW and simulation.frame_dt > 1.01 * shortest:
             simulation.frame_dt = simulation.frame_dt / 2
         elif took < FAST and simulation.frame_dt < 0.99 * wanted:

@@ -19,6 +19,7 @@ from gaussian_swaying import (
     Force,
     GaussianGust,
     GaussianSurfaceModel,
+    Live,
     LookAtCamera,
     Material,
     MPMSolver,
@@ -60,9 +61,19 @@ def _made():
     cloud, state = FLAG.generate(), simulation.start()
     normal = torch.tensor([[0.0, 0.0, 1.0]])
     return [
-        *(simulation, simulation.painter, simulation.setup, next(simulation.frames(1)), simulation.scene.frame),
+        *(simulation, simulation.painter, simulation.model, next(simulation.frames(1)), simulation.scene.frame),
         *(cloud, state, simulation.solver.points, GaussianSurfaceModel(cloud), FLAG, Scene(generator=FLAG)),
-        *(Material(), MaterialRegion(POLE), Sand(), Contact(), Copy(), Edit(E=1.0), Recorder(), InteriorFilling(0.1)),
+        *(
+            Live(),
+            Material(),
+            MaterialRegion(POLE),
+            Sand(),
+            Contact(),
+            Copy(),
+            Edit(E=1.0),
+            Recorder(),
+            InteriorFilling(0.1),
+        ),
         *(WindField(), SineSway(), UniformGust(), GaussianGust(), Turbulence(), ComputedAir([0.0] * 3, [1.0] * 3)),
         *(AeroForce(), WindForce(AeroForce(), WindField(), normal, torch.ones(1)), MPMSolver(0.1)),
         *(PinnedRegion(POLE), PinnedPoints([[0.0, 0.0, 0.0]]), POLE, Sphere([0.0] * 3, 1.0)),

@@ -137,7 +137,7 @@ def test_what_is_printed_tells_what_it_is():
     )
     frame = next(simulation.frames(1))
     assert repr(frame) == "Frame(0, time=0)"
-    for part in (frame.state, frame.gaussians, simulation.setup, simulation.painter, simulation.solver.points):
+    for part in (frame.state, frame.gaussians, simulation.model, simulation.painter, simulation.solver.points):
         assert "96, 3" in repr(part) or "96 Gaussians" in repr(part)
         assert len(repr(part)) < 1000
 

@@ -16,10 +16,10 @@ pytest.importorskip("cv2", reason="needs the extra [fit]")
 
 def test_the_wind_is_mirrored_at_the_normal_of_a_sheet(simulation):
     """The flag is nearly the plane of x and z: a wind along +x + y has the same pressure as one along -x + y."""
-    assert mirrored(simulation.setup, {"wind.azimuth": 56.0}) == pytest.approx(124.0, abs=3.0)
+    assert mirrored(simulation.model, {"wind.azimuth": 56.0}) == pytest.approx(124.0, abs=3.0)
     patches = simulation.scene.patches
     pressed = []
-    for azimuth in (56.0, mirrored(simulation.setup, {"wind.azimuth": 56.0})):
+    for azimuth in (56.0, mirrored(simulation.model, {"wind.azimuth": 56.0})):
         flow = torch.tensor(flow_of((3.0, 0.0, 0.0), {"wind.azimuth": azimuth}))
         pressed.append(float((patches.area * (patches.normal @ flow).square()).sum()))
     assert pressed[1] == pytest.approx(pressed[0], rel=1e-4)
@@ -27,16 +27,16 @@ def test_the_wind_is_mirrored_at_the_normal_of_a_sheet(simulation):
 
 def test_a_wind_across_a_sheet_or_along_it_is_its_own_mirror_image(simulation):
     """Along it, the image blows the other way: a flag would be on the other side of its pole, which a fit can try."""
-    assert mirrored(simulation.setup, {"wind.azimuth": 90.0}) is None
-    assert math.cos(math.radians(mirrored(simulation.setup, {"wind.azimuth": 0.0}))) == pytest.approx(-1, abs=0.01)
+    assert mirrored(simulation.model, {"wind.azimuth": 90.0}) is None
+    assert math.cos(math.radians(mirrored(simulation.model, {"wind.azimuth": 0.0}))) == pytest.approx(-1, abs=0.01)
 
 
 def test_a_large_patch_counts_as_its_area():
     """Nine patches that face x have less area than the one that faces y, at which the wind is mirrored."""
     normal = torch.tensor([[1.0, 0.0, 0.0]] * 9 + [[0.0, 1.0, 0.0]])
     area = torch.tensor([0.001] * 9 + [0.5])
-    setup = SimpleNamespace(scene=SimpleNamespace(patches=SimpleNamespace(normal=normal, area=area)))
-    assert mirrored(setup, {"wind.azimuth": 56.0}) == pytest.approx(124.0)
+    model = SimpleNamespace(scene=SimpleNamespace(patches=SimpleNamespace(normal=normal, area=area)))
+    assert mirrored(model, {"wind.azimuth": 56.0}) == pytest.approx(124.0)
 
 
 def test_a_body_that_faces_all_ways_has_no_mirror_image(simulation):
@@ -45,21 +45,21 @@ def test_a_body_that_faces_all_ways_has_no_mirror_image(simulation):
     normal, own = torch.stack([turn.cos(), turn.sin(), torch.zeros_like(turn)], -1), patches.normal
     patches.normal = normal
     try:
-        assert mirrored(simulation.setup, {"wind.azimuth": 56.0}) is None
+        assert mirrored(simulation.model, {"wind.azimuth": 56.0}) is None
     finally:
         patches.normal = own
 
 
 def test_rivals_lie_within_the_ranges(simulation):
     sought = [read_unknown("wind.azimuth", [-80.0, 160.0]), read_unknown("material.E", [1e3, 1e5])]
-    softer, stiffer, other = rivals_of(simulation.setup, sought, [0.5, 0.95])
+    softer, stiffer, other = rivals_of(simulation.model, sought, [0.5, 0.95])
     assert (softer, stiffer) == ([0.5, pytest.approx(0.95 - SHAKEN)], [0.5, 1.0])
     assert sought[0].value(other[0]) == pytest.approx(140.0, abs=3.0)
     assert other[1] == 0.95
     narrow = [read_unknown("wind.azimuth", [0.0, 90.0])]
-    assert rivals_of(simulation.setup, narrow, [0.5]) == []  # 135 degrees is known to be wrong
+    assert rivals_of(simulation.model, narrow, [0.5]) == []  # 135 degrees is known to be wrong
     around = [read_unknown("wind.azimuth", [150.0, 450.0])]
-    (again,) = rivals_of(simulation.setup, around, [0.6])  # 330 degrees is -30
+    (again,) = rivals_of(simulation.model, around, [0.6])  # 330 degrees is -30
     assert around[0].value(again[0]) == pytest.approx(210.0, abs=3.0)
 
 
@@ -68,7 +68,7 @@ def test_a_fit_tries_them_at_its_end(simulation, fit_of):
     made = fit_of({"wind.azimuth": [0.0, 180.0]})
     made._brief = lambda places, evidence, times: (places[::-1], [1.0, 2.0])
     others, better = made._others([0.3], [])
-    assert better == rivals_of(simulation.setup, made.plan.unknowns, [0.3])[0]
+    assert better == rivals_of(simulation.model, made.plan.unknowns, [0.3])[0]
     assert made.values(better)["wind.azimuth"] == pytest.approx(180 - 54, abs=3.0)
     assert others == [made.values(better)]
 

@@ -26,7 +26,7 @@ def made(folder, metres_per_unit, **changes):
 def moved(simulation, values):
     """Motion of the particles after 0.3 s [scene units]."""
     *_, (state,) = states_of(simulation, [values], TIMES)
-    return simulation.scene.frame.displacement_to_scene(state.position - simulation.setup.points.position)
+    return simulation.scene.frame.displacement_to_scene(state.position - simulation.model.points.position)
 
 
 @pytest.mark.parametrize("values", [{}, {"wind.speed": 4.0, "material.E": 2e4, "wind.speed@0.3": 2.0}])

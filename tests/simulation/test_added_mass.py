@@ -41,7 +41,7 @@ def test_still_air_slows_a_hanging_sheet(formulation, hanging):
     without = hanging(air(0.0), formulation=formulation)
     carrying = hanging(air(), formulation=formulation, frame_dt=0.04 / SLOWER)
     slow, fast = (advanced(simulation, 15)[0].position for simulation in (carrying, without))
-    assert float((fast - without.setup.points.position).abs().amax()) > 0.02
+    assert float((fast - without.model.points.position).abs().amax()) > 0.02
     torch.testing.assert_close(slow, fast, rtol=0, atol=1e-9)
 
 
@@ -78,7 +78,7 @@ def test_energy_is_kept_in_still_air_without_drag(hanging):
     for simulation in (without, carrying):
         first = simulation.stepper.at_first(simulation.start()).read()
         logs.append([first, *advanced(simulation, 25)[1]])
-    mass, position = without.setup.points.mass, without.setup.points.position
+    mass, position = without.model.points.mass, without.model.points.position
     weight = mass[:, None] * torch.tensor([0.0, 0.5, -9.8], dtype=torch.float64)
     assert logs[1][0].potential == pytest.approx(-float((weight * position).sum()))
     for name in ("kinetic", "elastic", "potential"):
@@ -128,11 +128,11 @@ def test_a_batch_is_as_each_alone(hanging):
 def test_a_changed_breadth_binds_again_and_another_coefficient_does_not(hanging):
     simulation = hanging(air())
     state = simulation.start()
-    stepper, points = simulation.stepper, simulation.setup.points
+    stepper, points = simulation.stepper, simulation.model.points
     area = simulation.scene.patches.areas()
 
     def carried():
-        assert simulation.setup.points.mass is points.mass  # the material itself
+        assert simulation.model.points.mass is points.mass  # the material itself
         return (simulation.solver.points.mass - points.mass) / area
 
     torch.testing.assert_close(carried(), torch.full_like(area, added_mass_per_area(BREADTH, 1.225)))
@@ -150,14 +150,14 @@ def test_a_changed_breadth_binds_again_and_another_coefficient_does_not(hanging)
     assert stepper.lift is None
     assert stepper.forces == [stepper.wind_force]  # C_D is not zero any more
     simulation.change("aero.added_mass", 0.0)
-    assert simulation.solver.points is simulation.setup.points
+    assert simulation.solver.points is simulation.model.points
     assert torch.isfinite(simulation.advance(state)[0].position).all()
 
 
 def test_an_edit_keeps_the_air(hanging):
     simulation = hanging(air())
     state = simulation.edit(simulation.start(), Edit(density=60.0))
-    expected = simulation.setup.points.mass + added_mass_per_area(BREADTH, 1.225) * simulation.scene.patches.areas()
+    expected = simulation.model.points.mass + added_mass_per_area(BREADTH, 1.225) * simulation.scene.patches.areas()
     torch.testing.assert_close(simulation.solver.points.mass, expected)
     assert torch.isfinite(simulation.advance(state)[0].position).all()
 

@@ -183,17 +183,17 @@ def test_numbers_change_and_edits_act_on_all():
     first = next(frames)
     drawn = first.gaussians.colors
     second = next(frames)
-    assert [setup.points.youngs_modulus[0] for setup in simulation.stepper.setups] == [3e5] * 3
+    assert [model.points.youngs_modulus[0] for model in simulation.stepper.models] == [3e5] * 3
     red = second.gaussians.colors
     assert torch.equal(first.gaussians.means[:106], _coloured().means.roll(10, 0))
     torch.testing.assert_close(red[10:], torch.tensor([1.0, 0.0, 0.0]).expand(3 * 96, 3))
     torch.testing.assert_close(red[:10], drawn[:10])
     simulation.wind = [0.0, 0.0, 0.0]
-    assert all(float(setup.wind(torch.zeros(1)).abs().max()) == 0 for setup in simulation.stepper.setups)
+    assert all(float(model.wind(torch.zeros(1)).abs().max()) == 0 for model in simulation.stepper.models)
     other = _simulation(ROW)
     assert other.start().position.shape == (3, 96, 3)
     other.change("wind.speed", 1.0)
-    assert float(other.stepper.setups[1].wind(torch.zeros(1)).norm()) == pytest.approx(1.0)
+    assert float(other.stepper.models[1].wind(torch.zeros(1)).norm()) == pytest.approx(1.0)
 
 
 # ---- places

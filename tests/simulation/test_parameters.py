@@ -16,17 +16,8 @@ from gaussian_swaying.fitting.variants import states_of
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation import model
 from gaussian_swaying.simulation.body import Material, Scene
-from gaussian_swaying.simulation.model import (
-    Edit,
-    in_settings,
-    of_settings,
-    parameter,
-    present,
-    value_of,
-    with_values,
-)
+from gaussian_swaying.simulation.model import Edit, in_settings, names, number, of_settings
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep
 from gaussian_swaying.sweeps.together import grouped
@@ -38,7 +29,7 @@ CONFIG["solver"]["damping"] = 0.5
 CONFIG["wind"]["modulations"] = [{"class_path": name} for name in ("SineSway", "UniformGust", "GaussianGust")]
 OTHERS = {"wind.flow": [1.0, 2.0, 0.5], "wind.seed": 7, "solver.gravity": [0.0, 0.0, -1.0], "material.nu": 0.1}
 PLACES = {"amplitude": 0, "period": 0, "phase": 0, "delta": 1, "std": 2, "interval": 1}
-NAMES = [name.replace("*", str(PLACES.get(name.split(".")[-1], 0))) for name in model.names()]
+NAMES = [name.replace("*", str(PLACES.get(name.split(".")[-1], 0))) for name in names()]
 
 
 @pytest.fixture
@@ -55,25 +46,23 @@ def config(tmp_path):
 
 @pytest.fixture
 def breath(tmp_path, monkeypatch):
-    """A configuration with a force from a module of the user's, which registers its number in one line."""
+    """A configuration with a force from a module of the user's, whose class names its number."""
     code = (
         "import torch\n"
-        "from gaussian_swaying.mpm.forces import Force\n"
-        "from gaussian_swaying.simulation.model import register\n\n"
+        "from gaussian_swaying import Force, Live\n\n"
         "class Breath(Force):\n"
+        '    live = {"strength": Live(unit="N", low=0.0, high=9.0)}\n\n'
         "    def __init__(self, strength: float = 0.1) -> None:\n"
         "        super().__init__()\n"
         "        self.strength = strength\n\n"
         "    def forward(self, state):\n"
-        "        return self.strength * state.position.new_tensor([0.0, 0.0, 1e-3]).expand_as(state.position)\n\n"
-        'register("forces.Breath.strength", unit="N", low=0.0, high=9.0)\n'
+        "        return self.strength * state.position.new_tensor([0.0, 0.0, 1e-3]).expand_as(state.position)\n"
     )
     (tmp_path / "users_breath.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))
     path = tmp_path / "breath.yaml"
     path.write_text(yaml.safe_dump(CONFIG | {"forces": [{"class_path": "users_breath.Breath"}]}))
     yield path
-    model._KNOWN.pop("forces.Breath.strength", None)
     sys.modules.pop("users_breath", None)
 
 
@@ -83,23 +72,23 @@ def _close(found, wanted):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_what_is_written_is_read_and_is_that_of_the_configuration(name, config, parser):
-    """In a setup, in a simulation that goes on, and in settings, from which a simulation is made."""
+    """In a model, in a simulation that goes on, and in settings, from which a simulation is made."""
     simulation = Simulation.from_yaml(config, device="cpu")
-    before = simulation.setup
-    old = value_of(before, name)
+    before = simulation.model
+    old = before.value(name)
     value = OTHERS.get(name, 0.5 * old + 0.01 if not isinstance(old, list) else None)
-    changed = with_values(before, {name: value})
-    _close(value_of(changed, name), value)
-    _close(value_of(before, name), old)  # as it was
+    changed = before.at({name: value})
+    _close(changed.value(name), value)
+    _close(before.value(name), old)  # as it was
     simulation.advance(simulation.start())
     simulation.change(name, value)
-    _close(value_of(simulation.setup, name), value)
+    _close(simulation.model.value(name), value)
     settings = parser.parse_args(["--config", str(config), "--device=cpu"])
     _close(of_settings(settings, name), old)
-    in_settings(settings, name, value)
+    in_settings(settings, {name: value})
     _close(of_settings(settings, name), value)
     made = Simulation.from_settings(parser, settings)
-    _close(value_of(made.setup, name), value)
+    _close(made.model.value(name), value)
     for simulated in (simulation, made):  # also from rest, they are the same
         assert simulated.start().position.isfinite().all()
     ends = [simulated.advance(simulated.start())[0].position for simulated in (simulation, made)]
@@ -114,9 +103,9 @@ def test_what_is_written_is_read_and_is_that_of_the_configuration(name, config, 
         ("wind.speed", -1.0, "from 0 to 10000"),
         ("aero.C_L", math.nan, "from -10000 to 10000"),
         ("wind.flow", [1.0, 2.0], "wind.flow"),
-        ("material.stiffness", 1.0, "no parameter"),
+        ("material.stiffness", 1.0, "no number"),
         ("wind.modulations.7.period", 1.0, "add the modulation"),
-        ("forces.Nothing.strength", 1.0, "no parameter"),
+        ("forces.Nothing.strength", 1.0, "no number"),
         ("wind.seed", 1.5, "wind.seed"),
         ("material.E", "soft", "material.E"),
         ("material.E", True, "material.E"),
@@ -125,19 +114,19 @@ def test_what_is_written_is_read_and_is_that_of_the_configuration(name, config, 
 def test_what_is_out_of_range_or_not_there_is_refused_and_nothing_changes(name, value, words, config):
     simulation = Simulation.from_yaml(config, device="cpu")
     simulation.start()
-    before = simulation.setup
+    before = simulation.model
     with pytest.raises((ValueError, TypeError), match=words):
         simulation.change({"material.density": 30.0, name: value})
-    after = simulation.setup
+    after = simulation.model
     assert all(getattr(after, part) is getattr(before, part) for part in ("points", "wind", "aero", "solver"))
 
 
 @pytest.mark.parametrize("name", ["material.E", "material.nu"])
 def test_what_says_where_the_layers_lie_is_not_changed(name):
     scene = Scene(generator=FlagScene(0.4, 0.3, 0.05), metres_per_unit=1.0, layers=3)
-    setup = Simulation(scene, Material(E=1e4, bending=1e-4), solver=MPMSolver(dx=0.1), device="cpu").setup
+    model = Simulation(scene, Material(E=1e4, bending=1e-4), solver=MPMSolver(dx=0.1), device="cpu").model
     with pytest.raises(ValueError, match=f"`{name}` is to change, but with `material.bending`"):
-        with_values(setup, {name: 0.2})
+        model.at({name: 0.2})
 
 
 def test_a_plate_of_one_layer_stiffens_with_what_changes():
@@ -145,9 +134,9 @@ def test_a_plate_of_one_layer_stiffens_with_what_changes():
     scene = Scene(generator=FlagScene(0.4, 0.3, 0.05), metres_per_unit=1.0)
     changes = {"material.E": 3e4, "material.nu": 0.0, "material.thickness": 0.02}
     for bending, factor in (("plate", 3 * (1 - 0.3**2) * 2**3), (1e-4, 1.0)):
-        setup = Simulation(scene, Material(E=1e4, bending=bending), solver=MPMSolver(dx=0.1), device="cpu").setup
-        changed = with_values(setup, changes)
-        torch.testing.assert_close(changed.points.bending, factor * setup.points.bending)
+        model = Simulation(scene, Material(E=1e4, bending=bending), solver=MPMSolver(dx=0.1), device="cpu").model
+        changed = model.at(changes)
+        torch.testing.assert_close(changed.points.bending, factor * model.points.bending)
 
 
 def test_material_that_a_region_gives_is_not_changed_everywhere(tmp_path):
@@ -155,17 +144,17 @@ def test_material_that_a_region_gives_is_not_changed_everywhere(tmp_path):
     material = CONFIG["material"] | {"regions": [{"region": region, "E": 2e4}]}
     path = tmp_path / "regions.yaml"
     path.write_text(yaml.safe_dump(CONFIG | {"material": material}))
-    setup = Simulation.from_yaml(path, device="cpu").setup
+    model = Simulation.from_yaml(path, device="cpu").model
     with pytest.raises(ValueError, match=r"material\.regions"):
-        with_values(setup, {"material.E": 1e3})
-    assert with_values(setup, {"material.density": 30.0}).points is not setup.points
+        model.at({"material.E": 1e3})
+    assert model.at({"material.density": 30.0}).points is not model.points
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if parameter(name).differentiable and name != "wind.flow"])
+@pytest.mark.parametrize("name", [name for name in NAMES if number(name).differentiable and name != "wind.flow"])
 def test_gradients_are_kept(name, config):
-    setup = Simulation.from_yaml(config, device="cpu").setup
-    value = torch.tensor(value_of(setup, name), dtype=torch.float64, requires_grad=True)
-    changed = with_values(setup, {name: value})
+    model = Simulation.from_yaml(config, device="cpu").model
+    value = torch.tensor(model.value(name), dtype=torch.float64, requires_grad=True)
+    changed = model.at({name: value})
     points, aero = changed.points, changed.aero
     total = sum(part.double().sum() for part in (points.mass, points.volume, points.youngs_modulus))
     total = total + points.poisson_ratio.double().sum() + aero.C_D + aero.C_F + aero.C_L
@@ -174,21 +163,21 @@ def test_gradients_are_kept(name, config):
 
 
 def test_a_gradient_that_would_be_lost_is_refused(config):
-    setup = Simulation.from_yaml(config, device="cpu").setup
+    model = Simulation.from_yaml(config, device="cpu").model
     with pytest.raises(ValueError, match="lose its gradient"):
-        with_values(setup, {"wind.speed": torch.tensor(1.0, requires_grad=True)})
+        model.at({"wind.speed": torch.tensor(1.0, requires_grad=True)})
 
 
 def test_angles_are_set_together(config):
-    setup = Simulation.from_yaml(config, device="cpu").setup
-    found = with_values(setup, {"wind.speed": 2.0, "wind.azimuth": 90.0, "wind.elevation": 30.0})
-    _close(value_of(found, "wind.flow"), [0.0, math.sqrt(3), 1.0])
+    model = Simulation.from_yaml(config, device="cpu").model
+    found = model.at({"wind.speed": 2.0, "wind.azimuth": 90.0, "wind.elevation": 30.0})
+    _close(found.value("wind.flow"), [0.0, math.sqrt(3), 1.0])
 
 
 def test_a_number_of_a_users_force_is_live_without_a_parse(breath, parser, monkeypatch):
     settings = parser.parse_args(["--config", str(breath), "--device=cpu"])
     session = Session(parser, settings)
-    assert present(session.simulation.setup, "forces.") == ["forces.Breath.strength"]
+    assert session.simulation.model.numbers("forces.") == ["forces.Breath.strength"]
     for name in ("parse_object", "dump", "instantiate"):
         monkeypatch.setattr(parser, name, lambda *_, **__: pytest.fail("parsed"))
     session._change({"forces.Breath.strength": 3.0, "material.E": 2e4, "wind.flow": [1.0, 0.0, 0.0]})
@@ -197,7 +186,7 @@ def test_a_number_of_a_users_force_is_live_without_a_parse(breath, parser, monke
     assert settings.forces[0].init_args.strength == 0.1  # those before the change, for undo
     session._undo()
     assert session.simulation.custom_forces[0].strength == 0.1
-    _close(value_of(session.simulation.setup, "material.E"), 1e4)
+    _close(session.simulation.model.value("material.E"), 1e4)
     with pytest.raises(ValueError, match="from 0 to 9"):
         changed_settings(parser, settings, {"forces.Breath.strength": 10.0})
 

@@ -86,7 +86,7 @@ def test_the_configurations_of_a_group_are_those_that_the_parser_writes(tmp_path
     for run in plan.runs[6::6]:
         settings.append(settings[0].clone())
         for name, value in run.items():
-            in_settings(settings[-1], name, value)
+            in_settings(settings[-1], {name: value})
     expected = [config_text(parser, one) for one in settings]
     assert len(set(expected)) == 6
 

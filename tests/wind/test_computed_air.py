@@ -211,10 +211,10 @@ def test_a_batch_gradients_and_another_frame_are_refused():
     stepper, state, _ = _run(_simulation(), 1)
     with pytest.raises(RuntimeError, match="no gradients"):
         stepper.advance(state.replace(velocity=state.velocity.clone().requires_grad_()))
-    stepper.frame_dt = 0.03
+    stepper.model = stepper.model.replace(frame_dt=0.03)
     with pytest.raises(RuntimeError, match="length of the frame"):
         stepper.advance(state)
-    assert "set `air` to null" in why_not_batched(stepper.setup)
+    assert "set `air` to null" in why_not_batched(stepper.model)
 
 
 def test_what_a_box_costs_and_resolves():

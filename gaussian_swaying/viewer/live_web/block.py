@@ -50,13 +50,13 @@ def check(simulation: Simulation) -> None:
     Args:
         simulation: The simulation, not started.
     """
-    solver, setup = simulation.solver, simulation.setup
+    solver, model = simulation.solver, simulation.model
     if not isinstance(solver, MPMSolver):
         raise _refused("`custom_solver`", "leave it out")
     sways = solver.formulation == "modes"
     if not sways and solver.formulation != "total":
         raise _refused(f"`solver.formulation: {solver.formulation}`", "set it to total")
-    if setup.scene.surface_places is not None and setup.scene.surface_places.contact is not None:
+    if model.scene.surface_places is not None and model.scene.surface_places.contact is not None:
         raise _refused("`contact` of the material with itself", "set `contact` to null")
     if simulation.stepper.copies is not None:
         raise _refused("`copies`", "leave them out")
@@ -64,15 +64,15 @@ def check(simulation: Simulation) -> None:
         raise _refused("`edits`", "leave them out")
     if simulation.stepper.joints:
         raise _refused("joints of `scene.parts`", "leave out `joint_stiffness` and `joint_turning` of its parts")
-    if setup.points.bending is not None:
+    if model.points.bending is not None:
         raise _refused("`material.bending` of a sheet of one layer", "set `scene.layers` to 3")
-    if setup.aero.carried:
+    if model.aero.carried:
         raise _refused("the air that the material carries", "set `aero.added_mass` to 0")
-    if setup.air is not None:
+    if model.air is not None:
         raise _refused("computed air", "set `air` to null")
-    if setup.forces:
+    if model.forces:
         raise _refused("`forces` of your own", "leave them out")
-    wind = setup.wind
+    wind = model.wind
     stirred = sways and isinstance(wind, WindField) and list(map(type, wind.effects)) == [Turbulence]
     if type(wind) is not WindField or not (wind.uniform or stirred):
         remedy = "leave out `wind.effects`, of which `solver.formulation: modes` takes one Turbulence"
@@ -82,7 +82,7 @@ def check(simulation: Simulation) -> None:
             raise _refused(f"the {type(modulation).__name__} in `wind.modulations`", "leave it out")
     if sways:  # it checks the rest itself
         return
-    for law in setup.points.laws:
+    for law in model.points.laws:
         if type(law) not in LAWS:
             known = ", ".join(one.__name__ for one in LAWS)
             raise _refused(f"the law {type(law).__name__} in `material.law`", f"take one of {known}")
@@ -100,7 +100,7 @@ def in_webassembly(simulation: Simulation) -> bool:
         solver.formulation == "total"
         and plain
         and solver.stiffness_damping == 0
-        and all(type(law) in known for law in simulation.setup.points.laws)
+        and all(type(law) in known for law in simulation.model.points.laws)
     )
 
 

@@ -27,7 +27,7 @@ def load_of(simulation: Simulation) -> float:
     """Material points times substeps in a second of a simulation at rest [1/s], in those of the fast pass."""
     slower = 1.0 if in_webassembly(simulation) else IN_JAVASCRIPT
     steps = simulation.solver.substeps(simulation.start(), simulation.frame_dt)
-    return slower * simulation.setup.points.count * steps / simulation.frame_dt
+    return slower * simulation.model.points.count * steps / simulation.frame_dt
 
 
 def fitted(parser: ArgumentParser, settings: Namespace, target: str) -> tuple[Simulation, str]:
@@ -53,7 +53,7 @@ def fitted(parser: ArgumentParser, settings: Namespace, target: str) -> tuple[Si
         return load_of(made[dx])
 
     dx, found = finest_within(load, configured, budget)
-    speed, points = budget / found, made[dx].setup.points.count
+    speed, points = budget / found, made[dx].model.points.count
     what = "Kept the configured grid" if dx == configured else f"Chose a grid of {dx:.3g} m instead of {configured:g} m"
     if settings.scene.points == "gaussian":
         what += ", with `scene.points: grid`,"

@@ -199,7 +199,7 @@ def test_what_the_visitor_does_to_modes(sway, in_node):
     wind = {"kind": "wind", "flow": [0.0, -2.0, 0.0], "gusts": 0.0}
     frames, stiffer = {"kind": "frames", "count": 10}, {"kind": "stiffness", "factor": 2.0}
     _, moved = in_node(simulation, frames, wind, stiffer, {"kind": "reset"}, frames)
-    modulus = 2 * float(simulation.setup.points.youngs_modulus[0])
+    modulus = 2 * float(simulation.model.points.youngs_modulus[0])
     same = sway(
         solver={"gravity": [0.0, 0.0, -9.8]}, wind={"flow": wind["flow"], "effects": []}, material={"E": modulus}
     )
