@@ -48,7 +48,7 @@ def at_scale(model: Model, metres_per_unit: float) -> Model:
         changes["material.density"] = model.value("material.density") / ratio
     found = model.at(changes | {"solver.gravity": [part / ratio for part in gravity]})
     if model.points.bending is not None:
-        found = replace(found, points=replace(found.points, bending=model.points.bending / ratio**5))
+        found = found.replace(points=replace(found.points, bending=model.points.bending / ratio**5))
     if model.aero.added_mass:
         found = replace(found, aero=changed(model.aero, added_mass=model.aero.added_mass / ratio))
     return replace(found, wind=changed(wind, flows=wind.flows / ratio))

@@ -115,7 +115,7 @@ def natural(simulation: Simulation, kind: Kind, flow: Tensor, intensity: float) 
         for value, modulus in stiffer.items():
             E[points.youngs_modulus == value] = modulus
         points = replace(points, mass=points.mass * thicker, volume=points.volume * thicker, youngs_modulus=E)
-        simulation.adopt(replace(model, points=points, aero=aero))
+        simulation.adopt(model.replace(points=points, aero=aero))
         if used is stiffer:
             whole = Total(points, solver.framed(scene.frame), model.solver)
             volume, whole_mass = points.volume.double(), points.mass.double().sum()

@@ -34,7 +34,7 @@ from gaussian_swaying.rendering.protocol import Renderer, RenderOutput
 from gaussian_swaying.rendering.shading import Shader
 from gaussian_swaying.simulation.body import SimulatedScene
 from gaussian_swaying.simulation.measure import FrameDiagnostics
-from gaussian_swaying.simulation.step import Copies, Launched, SceneEditor, Stepper
+from gaussian_swaying.simulation.step import Launched, SceneEditor, Stepper
 from gaussian_swaying.wind.field import WindField
 
 MAX_PIXELS = 1 << 26  # per picture: twice as many as 8K
@@ -44,12 +44,11 @@ class Painter(Fixed, nn.Module):
     """Draws a simulated scene from its cameras.
 
     Args:
-        scene: The Gaussians, and how they follow the material.
+        stepper: Has the Gaussians, and how they follow the material.
         shader: Colours from normals and light; None keeps the colours of the splat.
         camera: Camera path; an orbit camera if None.
         cameras: Further cameras by name.
         background: Background colour, in [0, 1].
-        frame_dt: Time between frames [s].
         renderer: Draws the Gaussians; by default gsplat on CUDA and the torch renderer elsewhere, chosen at the first
             picture.
 
@@ -57,23 +56,22 @@ class Painter(Fixed, nn.Module):
         ValueError: If the background or the name of a camera is invalid.
     """
 
-    assignable = ("shader", "camera", "cameras", "background", "frame_dt")
+    assignable = ("shader", "camera", "cameras", "background")
 
     def __init__(
         self,
-        scene: SimulatedScene,
+        stepper: Stepper,
         shader: Shader | None = None,
         camera: CameraPath | None = None,
         cameras: Mapping[str, CameraPath] | None = None,
         background: Sequence[float] = (0.0, 0.0, 0.0),
-        frame_dt: float = 0.04,
         renderer: Renderer | None = None,
     ) -> None:
         super().__init__()
         if not all(0 <= value <= 1 for value in background):
             raise ValueError(f"Expected `background` within [0, 1], but got {list(background)}: 1 is white, not 255.")
-        self.scene, self.shader, self.frame_dt = scene, shader, float(frame_dt)
-        origin = scene.model.origin
+        self.stepper, self.shader = stepper, shader
+        origin = self.scene.model.origin
         self.camera = (camera or OrbitCamera()).counted_from(origin)
         self.cameras = {name: path.counted_from(origin) for name, path in (cameras or {}).items()}
         for name in self.cameras:
@@ -81,11 +79,19 @@ class Painter(Fixed, nn.Module):
         self.register_buffer("background", torch.tensor(background, dtype=torch.float32))
         self.background: Tensor
         self._renderer = renderer
-        self.turn = Turn()
-        """The lock of the thread that steps or draws the simulation."""
         self._moved, self._coloured = Replayed(), Replayed()
         self._rest: tuple[Camera, object, Tensor, Tensor] | None = None  # of many Gaussians that do not move
         self._still: dict[str, tuple[tuple[object, ...], Camera]] = {}  # cameras of the last frame that do not move
+
+    @property
+    def scene(self) -> SimulatedScene:
+        """The Gaussians, and how they follow the material."""
+        return self.stepper.scene
+
+    @property
+    def turn(self) -> Turn:
+        """The lock of the thread that steps or draws the simulation."""
+        return self.stepper.turn
 
     @property
     def device(self) -> torch.device:
@@ -131,7 +137,7 @@ class Painter(Fixed, nn.Module):
     def _camera(self, frame: int, name: str = "") -> Camera:
         """The camera of a frame, in float64 on the host."""
         path = self.cameras[name] if name else self.camera
-        return path(frame, frame * self.frame_dt, self.center, self.scene.frame.rotation[2], self.size)
+        return path(frame, frame * self.stepper.frame_dt, self.center, self.scene.frame.rotation[2], self.size)
 
     def check_camera(self, frame: int) -> None:
         """Raise ValueError if a camera of a frame lies inside the box of the object at rest, or has too many pixels.
@@ -330,14 +336,15 @@ class CopiesPainter(Painter):
     centres, shapes, normals and colours exist for each copy; harmonics and opacities are those of the splat.
 
     Args:
-        scene: As for :class:`Painter`.
-        copies: The copies.
+        stepper: Has copies.
         parts: The other arguments of a :class:`Painter`.
     """
 
-    def __init__(self, scene: SimulatedScene, copies: Copies, *parts: Any) -> None:
-        super().__init__(scene, *parts)
-        self.copies = copies
+    def __init__(self, stepper: Stepper, *parts: Any) -> None:
+        super().__init__(stepper, *parts)
+        assert stepper.copies is not None
+        self.copies, scene = stepper.copies, stepper.scene
+        copies = self.copies
         count = len(scene.model.means)
         moves, belongs = torch.zeros(count, dtype=torch.bool), torch.zeros(count, dtype=torch.bool)
         moves[scene.moving], belongs[scene.simulated], belongs[scene.carried] = True, True, True

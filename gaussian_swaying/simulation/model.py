@@ -183,9 +183,8 @@ class Model:
     """All that decides how a scene moves. Never changed in place: another value makes another model.
 
     Attributes:
-        scene: The scene at rest.
+        scene: The scene at rest, with the material of its points.
         material: The material that was given.
-        points: The material of the points.
         wind: The wind.
         aero: The force of the wind on patches.
         forces: The custom forces.
@@ -196,7 +195,6 @@ class Model:
 
     scene: SimulatedScene
     material: Material
-    points: MaterialPoints
     wind: WindField | SpatialWind
     aero: AeroForce
     forces: tuple[Force, ...]
@@ -204,9 +202,15 @@ class Model:
     air: ComputedAir | None = None
     frame_dt: float = 0.04
 
-    def replace(self, **parts: Any) -> Model:
-        """A model with other parts."""
-        return replace(self, **parts)
+    @property
+    def points(self) -> MaterialPoints:
+        """The material of the points."""
+        return self.scene.points
+
+    def replace(self, *, points: MaterialPoints | None = None, **parts: Any) -> Model:
+        """A model with other parts; ``points`` are those of its scene."""
+        scene = parts.pop("scene", self.scene)
+        return replace(self, scene=scene if points is None else changed(scene, points=points), **parts)
 
     def at(self, name: str | Mapping[str, Any], value: Any = None) -> Model:
         """A model with another value of a number, ``model.at("material.E", 2e5)``, or of several by their names.
@@ -320,7 +324,7 @@ def _with_material(model: Model, numbers: Mapping[str, Any]) -> Model:
             points = replace(points, **{own: torch.zeros_like(getattr(points, own)) + numbers[name]})
     if "density" in numbers:
         points = replace(points, mass=points.volume * numbers["density"])
-    return replace(model, points=points, material=replace(material, **numbers))
+    return model.replace(points=points, material=replace(material, **numbers))
 
 
 def _check_one_layer(model: Model) -> None:

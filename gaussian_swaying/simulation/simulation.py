@@ -237,12 +237,12 @@ class Simulation(Fixed):
         camera = as_camera(camera, cameras, blowing, seen)
         own = tuple(force.in_frame(seen.frame) for force in as_forces(forces))
         aero = aero or AeroForce()
-        model = Model(seen, material, seen.points, blowing, aero, own, solver.settings, air, float(frame_dt))
+        model = Model(seen, material, blowing, aero, own, solver.settings, air, float(frame_dt))
         wait_for_device()
         placed = copies_of(copies, model, solver) if copies else None
-        drawing = (shader, camera, cameras, colour, frame_dt, renderer)
-        self._painter = Painter(seen, *drawing) if placed is None else CopiesPainter(seen, placed, *drawing)
-        self._stepper = Stepper(solver, model, turn=self._painter.turn, copies=placed)
+        self._stepper = Stepper(solver, model, copies=placed)
+        drawing = (self._stepper, shader, camera, cameras, colour, renderer)
+        self._painter = Painter(*drawing) if placed is None else CopiesPainter(*drawing)
         self.to(target)
         self._editor = SceneEditor(self._stepper, edits)
         self._recorder = self._recorder_or(recorder)
@@ -274,7 +274,7 @@ class Simulation(Fixed):
     @property
     def scene(self) -> SimulatedScene:
         """Gaussians, material points and patches."""
-        return self._painter.scene
+        return self._stepper.scene
 
     @property
     def files(self) -> list[Path]:
@@ -294,7 +294,7 @@ class Simulation(Fixed):
     @property
     def turn(self) -> Turn:
         """The lock of the thread that steps or draws."""
-        return self._painter.turn
+        return self._stepper.turn
 
     @property
     def device(self) -> torch.device:
@@ -303,10 +303,9 @@ class Simulation(Fixed):
 
     def to(self, device: torch.device | str) -> Self:
         """Move all components to a device; returns the simulation."""
-        model, solver = self.model, self.solver
-        for part in (self._painter, solver, model.wind, model.aero, *model.forces):
+        model = self.model
+        for part in (self._painter, model.scene, self.solver, model.wind, model.aero, *model.forces):
             part.to(device)
-        self._stepper.take(model.replace(points=self.scene.points))
         return self
 
     # ---- numbers that may change
@@ -408,14 +407,12 @@ class Simulation(Fixed):
             raise
 
     def _adopt(self, model: Model) -> None:
-        before = self.model
+        editor, points = self._editor, model.points
         with torch.inference_mode(False):
             for part in (model.wind, model.aero, *model.forces):
                 part.to(self.device)
-            if model.points is not before.points:
-                self.scene.points = model.points
-                self._editor.rebase(model.points)
-            self._painter.frame_dt = model.frame_dt
+            if points is not self.model.points and editor.unedited is not None:
+                editor.unedited = changed(editor.unedited, points=points)
             self._stepper.take(model, running=self._stepper.starts > 0)
 
     def variant(self, values: Mapping[str, Any], recorder: Recorder | None = None, config: str = "") -> Simulation:
@@ -429,13 +426,10 @@ class Simulation(Fixed):
         Raises:
             ValueError: As :meth:`change`.
         """
-        points, sh0, shN = self._editor.unedited
-        other, model = copy.copy(self), self.model.replace(points=points).at(values)
-        solver = self.solver.like(model.solver)
-        scene = changed(self.scene, points=model.points, model=changed(self.scene.model, sh0=sh0, shN=shN))
-        other._painter = changed(self._painter, scene=scene)
-        model = model.replace(scene=scene, wind=model.wind.to(self.device))
-        other._stepper = Stepper(solver, model, turn=self.turn, copies=self._stepper.copies)
+        other, model = copy.copy(self), self.model.replace(scene=self._editor.unedited or self.scene).at(values)
+        model.wind.to(self.device)
+        other._stepper = Stepper(self.solver.like(model.solver), model, turn=self.turn, copies=self._stepper.copies)
+        other._painter = changed(self._painter, stepper=other._stepper)
         other._editor = SceneEditor(other._stepper, self._editor.edits)
         other._recorder, other._files = self._recorder_or(recorder), []
         other.config = config
@@ -783,12 +777,11 @@ class RecordedRun:
         Raises:
             ValueError: If the run recorded no motion.
         """
-        states, scene, editor = self._states(), self.simulation.scene, self.simulation.editor
+        states, editor = self._states(), self.simulation.editor
         step = self.simulation.frame_dt
         for frame, state in enumerate(states):
-            for edit in editor.due((frame + 1e-3) * step):
-                editor.apply(edit, flowed=frame > 0)
-            yield scene.deformed(state)
+            editor.apply(editor.due((frame + 1e-3) * step), flowed=frame > 0)
+            yield editor.scene.deformed(state)
 
     def _states(self) -> Iterator[Any]:
         """What the Gaussians follow in each frame."""

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._devices import in_double
-from gaussian_swaying._fixed import assign
+from gaussian_swaying._fixed import assign, changed
 from gaussian_swaying._turns import Turn, in_turn
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.geometry.regions import whereabouts
@@ -239,6 +239,9 @@ class Stepper:
         self._air: AirInBox | None = None
         self._tearing: TearingGauge | None = None
         self._gauge = Gauge()
+
+    def __repr__(self) -> str:
+        return f"Stepper({self.scene}, {self.solver})"
 
     # ---- what acts
 
@@ -839,27 +842,28 @@ class SceneEditor:
     """
 
     def __init__(self, stepper: Stepper, edits: Sequence[Edit] = ()) -> None:
-        self.stepper, self.scene = stepper, stepper.scene
+        self.stepper = stepper
         self.edits = sorted(edits, key=lambda edit: edit.time)
         self.applied = 0
         self.version = 0  # counts the changes of colour
-        self._loaded: tuple[MaterialPoints, Tensor, Tensor] | None = None
+        self.unedited: SimulatedScene | None = None  # as it was before its first edit, if there was one
         for edit in self.edits:
             self.reach(edit)
 
-    # ---- with the stepper
+    @property
+    def scene(self) -> SimulatedScene:
+        """The scene as it is now."""
+        return self.stepper.scene
 
     def start(self) -> State:
         """The state at rest at time zero, with the edits of that time applied."""
         self.reset()
         for later in (moment for moment in self.times if moment > 0):  # refuse impossible edits now
-            self._apply_all(self.due(0.0))
-            self._apply_all(self.due(later), flowed=True)
-            self._pass_on()
+            self.apply(self.due(0.0))
+            self.apply(self.due(later), flowed=True)
             self.stepper.rehearse()
         self.reset()
-        self._apply_all(self.due(0.0))
-        self._pass_on()
+        self.apply(self.due(0.0))
         return self.stepper.start()
 
     def edit(self, state: State, edits: Sequence[Edit]) -> State:
@@ -872,12 +876,12 @@ class SceneEditor:
         Returns:
             The state from which the run continues.
         """
-        before = self.snapshot()
+        before = self.stepper.model, self.unedited, self.version
         try:
             return self._go_on(state, edits)
         except Exception:
-            self.restore(before)
-            self._pass_on()
+            model, self.unedited, self.version = before
+            self.stepper.take(model)
             self.stepper.bind()
             raise
 
@@ -885,41 +889,23 @@ class SceneEditor:
         """Apply the edits up to the time of a state; a resumed state contains them already."""
         if not self.edits:  # the host need not wait for the time
             return state
-        edits = self.due(float(state.time) + 1e-3 * self.stepper.frame_dt)
-        edited = self._go_on(state, edits)
+        edited = self._go_on(state, self.due(float(state.time) + 1e-3 * self.stepper.frame_dt))
         return state if resumed else edited
 
     def _go_on(self, state: State, edits: Sequence[Edit]) -> State:
         """Apply edits; the internal variable of particles that get another law starts anew."""
-        changed = self._apply_all(edits, flowed=True)
-        rest = self._pass_on(running=True)
+        rest = self.apply(edits, flowed=True, running=True)
         if rest is None:
             return state
         start = rest.internal
         if start is not None and state.internal is not None:
-            start = state.internal if changed is None else torch.where(changed, start, state.internal)
+            fresh = torch.zeros_like(self.scene.points.mass, dtype=torch.bool)
+            for edit in edits:
+                fresh |= self.reach(edit)[0] & (edit.law is not None)
+            start = torch.where(fresh, start, state.internal)
         return state.replace(internal=start)
 
-    def _apply_all(self, edits: Sequence[Edit], flowed: bool = False) -> Tensor | None:
-        """Change the scene; returns which particles (P,) got another law, None if the material is the same."""
-        changed = [self.apply(edit, flowed) for edit in edits]
-        changed = [part for part, edit in zip(changed, edits, strict=True) if edit.of_material]
-        return torch.stack(changed).any(0) if changed else None
-
-    def _pass_on(self, running: bool = False) -> State | None:
-        """Give the material of the scene to the stepper."""
-        return self.stepper.take(self.stepper.model.replace(points=self.scene.points), running)
-
     # ---- the scene
-
-    def snapshot(self) -> tuple[MaterialPoints, nn.Parameter, nn.Parameter, int]:
-        """The scene as it is now, for :meth:`restore`."""
-        model = self.scene.model
-        return self.scene.points, model.sh0, model.shN, self.version
-
-    def restore(self, snapshot: tuple[MaterialPoints, nn.Parameter, nn.Parameter, int]) -> None:
-        """Put the scene back to what it was at a :meth:`snapshot`."""
-        self.scene.points, self.scene.model.sh0, self.scene.model.shN, self.version = snapshot
 
     @property
     def times(self) -> list[float]:
@@ -953,27 +939,13 @@ class SceneEditor:
                 )
         return particles, gaussians
 
-    def rebase(self, points: MaterialPoints) -> None:
-        """Set the material that the scene has before its edits, for :meth:`reset`."""
-        if self._loaded is not None:
-            self._loaded = (points, *self._loaded[1:])
-
-    @property
-    def unedited(self) -> tuple[MaterialPoints, Tensor, Tensor]:
-        """Material and colours (harmonics of degree 0, and of the others) without the edits."""
-        model = self.scene.model
-        return self._loaded or (self.scene.points, model.sh0.detach(), model.shN.detach())
-
     def reset(self) -> None:
         """Restore the scene as it was before its first edit."""
         self.applied = 0
-        if self._loaded is None:
-            return
-        device = self.scene.model.means.device
-        points, sh0, shN = self._loaded
-        self.scene.points = points.map(lambda tensor: tensor.to(device))
-        self._paint(sh0.to(device), shN.to(device))
-        self._loaded = None
+        if self.unedited is not None:
+            scene, self.unedited = self.unedited.to(self.stepper.device), None
+            self.version += 1
+            self.stepper.take(self.stepper.model.replace(scene=scene))
 
     def due(self, time: float) -> list[Edit]:
         """Return the edits up to a time [s] that were not yet applied, and mark them as applied."""
@@ -981,30 +953,24 @@ class SceneEditor:
         self.applied += len(found)
         return found
 
-    def apply(self, edit: Edit, flowed: bool = False) -> Tensor:
-        """Apply an edit to the scene.
+    def apply(self, edits: Sequence[Edit], flowed: bool = False, running: bool = False) -> State | None:
+        """Apply edits to the scene.
 
         Args:
-            edit: The change.
+            edits: The changes.
             flowed: See :func:`edited_points`.
-
-        Returns:
-            Which particles have another law now, bool, shape (P,).
+            running: As for :meth:`Stepper.take`, whose result is returned.
         """
-        particles, gaussians = self.reach(edit)
-        model = self.scene.model
-        if self._loaded is None:
-            self._loaded = self.unedited
-        with torch.inference_mode(False), torch.no_grad():
-            if edit.of_material:
-                self.scene.points = edited_points(self.scene.points, particles, edit, flowed)
-            if edit.color is not None:
-                sh = recolored(model.sh.detach(), gaussians, edit.color, edit.detail)
-                self._paint(sh[:, :1], sh[:, 1:])
-        return particles & (edit.law is not None)
-
-    def _paint(self, sh0: Tensor, shN: Tensor) -> None:
-        self.version += 1
-        with torch.inference_mode(False):
-            self.scene.model.sh0 = nn.Parameter(sh0.clone(), requires_grad=False)
-            self.scene.model.shN = nn.Parameter(shN.clone(), requires_grad=False)
+        scene = self.scene
+        if edits and self.unedited is None:
+            self.unedited = scene
+        for edit in edits:
+            particles, gaussians = self.reach(edit)
+            with torch.inference_mode(False), torch.no_grad():
+                if edit.of_material:
+                    scene = changed(scene, points=edited_points(scene.points, particles, edit, flowed))
+                if edit.color is not None:
+                    sh = recolored(scene.model.sh.detach(), gaussians, edit.color, edit.detail)
+                    scene = changed(scene, model=changed(scene.model, sh0=sh[:, :1].clone(), shN=sh[:, 1:].clone()))
+                    self.version += 1
+        return self.stepper.take(self.stepper.model.replace(scene=scene), running)

@@ -138,7 +138,7 @@ def test_the_record_says_what_runs(tmp_path, from_file):
     found = found["changed_in_python" if from_file else "made_in_python"]
     assert found["aero"]["law"] == "projected"
     assert found["shader"]["ambient"] == 0.25
-    assert found["frame_dt"] == simulation.painter.frame_dt == 0.02
+    assert found["frame_dt"] == simulation.model.frame_dt == 0.02
     assert found["wind"]["flows"]["sha256"] != WindField([0.0, 4.0, 1.0]).flows
     assert set(found) >= {"aero", "shader", "wind"}
     assert ("material" in found, "camera" in found) == (not from_file, not from_file)
