@@ -8,7 +8,7 @@ from pathlib import Path
 from gaussian_swaying import _program as program
 from gaussian_swaying._files import write_text
 from gaussian_swaying.cli.errors import run_command
-from gaussian_swaying.interop.physgaussian.convert import convert, read_config, to_yaml
+from gaussian_swaying.interop.physgaussian import convert, read_config, to_yaml
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -25,7 +25,6 @@ from gaussian_swaying._checks import check_frames, check_positive
 from gaussian_swaying._yaml_limits import limit_yaml
 from gaussian_swaying.captures.capture_camera import CaptureCamera
 from gaussian_swaying.config.material_names import NAMES, with_material_option, with_named_materials
-from gaussian_swaying.interop.physgaussian.convert import convert, read_config, to_yaml
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.rendering.cameras.keyframes import KeyframedCamera
 from gaussian_swaying.wind.effects import CylinderObstacle, EllipsoidObstacle
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
 CAMERA_PATHS = (CaptureCamera, KeyframedCamera)
 EFFECTS = (CylinderObstacle, EllipsoidObstacle, FrozenWind, Shelter, Turbulence)
 # options that a configuration file cannot contain; settings that may change when a run is resumed
-COMMAND_LINE_ONLY = ("preset", "physgaussian")
+COMMAND_LINE_ONLY = ("preset",)
 RUN_ONLY = ("config", "output", "device", "frames", "resume", "slow", "loop")
 # constructor arguments that a YAML file sets within a component instead; components that may be null
 PYTHON_ONLY = ("up", "hold", "renderer", "cloud")
@@ -49,23 +48,6 @@ NULLABLE = ("air", "contact", "normalisation")
 CUSTOM: dict[str, tuple[type, str]] = {"custom_wind": (SpatialWind, "wind"), "custom_solver": (Solver, "solver")}
 # arguments that may change between a run and the one that resumes it
 NOT_COMPARED = ("device", "recorder", "renderer", "cloud")
-
-
-class PhysGaussianAction(Action):
-    """Reads a PhysGaussian configuration as ``--config`` reads a YAML file, and prints the differences in meaning."""
-
-    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
-        """Convert the file and merge it into the settings parsed so far."""
-        from jsonargparse import ActionConfigFile
-
-        try:
-            settings, notes = convert(read_config(values))
-        except ValueError as error:  # which argparse would not report
-            raise TypeError(str(error)) from error
-        ActionConfigFile.apply_config(parser, namespace, "config", to_yaml(settings))
-        namespace["config"][-1] = values
-        for note in notes:
-            print(f"note: {note}", file=sys.stderr)
 
 
 class PresetAction(Action):
@@ -108,12 +90,6 @@ def build_parser(schema: type) -> ArgumentParser:
     parser.add_argument("-h", "--help", action=CommonHelp, help="Show the options that people use, and exit.")
     parser.add_argument("--help-all", action="help", help="Show all options, and exit.")
     parser.add_argument("--config", action="config", help="YAML file; options given after it override it.")
-    parser.add_argument(
-        "--physgaussian",
-        action=PhysGaussianAction,
-        default=SUPPRESS,
-        help="Like --config, for a JSON file of PhysGaussian, which is converted.",
-    )
     parser.add_argument(
         "--preset",
         action=PresetAction,

@@ -33,8 +33,6 @@ from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.neighbours import particle_spacing
 from gaussian_swaying.geometry.regions import Region, RegionInFrame
-from gaussian_swaying.interop.physgaussian.camera import PhysGaussianCamera
-from gaussian_swaying.interop.physgaussian.space import CENTER, rotation_matrix
 from gaussian_swaying.mpm.boundary import Boundary
 from gaussian_swaying.mpm.contact import Contact
 from gaussian_swaying.mpm.forces import Force
@@ -553,6 +551,40 @@ class Copy:
             check_whole("copies.seed", self.seed, 0)
 
 
+CENTER = (1.0, 1.0, 1.0)
+"""Centre of the simulated part in the normalised space."""
+
+
+def rotation_matrix(degrees: Sequence[float], axes: Sequence[int]) -> Tensor:
+    """Successive rotations by each angle about its axis.
+
+    Args:
+        degrees: Angles [degrees].
+        axes: 0, 1 or 2 for x, y or z, as many as angles.
+
+    Returns:
+        Scene axes to turned axes in float64, shape (3, 3).
+    """
+    if len(degrees) != len(axes):
+        raise ValueError(
+            f"Expected as many entries in `rotation_degree` as in `rotation_axis`, but got {len(degrees)} and "
+            f"{len(axes)}."
+        )
+    total = torch.eye(3, dtype=torch.float64)
+    for angle, axis in zip(check_vector("rotation_degree", degrees, len(degrees)), axes, strict=True):
+        if axis not in (0, 1, 2):
+            raise ValueError(f"Expected `rotation_axis` to hold 0, 1 or 2 for x, y or z, but got {axis!r}.")
+        i, j = ((1, 2), (2, 0), (0, 1))[int(axis)]
+        quarters, rest = divmod(angle, 90.0)
+        cosine, sine = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+        if rest == 0:  # without round-off
+            cosine, sine = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[int(quarters) % 4]
+        turn = torch.eye(3, dtype=torch.float64)
+        turn[i, i], turn[i, j], turn[j, i], turn[j, j] = cosine, -sine, sine, cosine
+        total = turn @ total
+    return total
+
+
 @fixed
 @dataclass
 class Normalisation:
@@ -619,7 +651,7 @@ class Normalisation:
             scene: Its region is in turned axes.
             material: Its regions are in the normalised space.
             solver: Its boundaries are in the normalised space.
-            camera: A :class:`PhysGaussianCamera` is in the normalised space; other cameras are in scene units.
+            camera: Converted by ``CameraPath.in_space``; most cameras are in scene units.
             cameras: Further cameras, likewise.
             edits: Their regions are in the normalised space.
             cloud: The Gaussians of the scene, if they have been read already.
@@ -640,15 +672,10 @@ class Normalisation:
         regions = [dataclasses.replace(e, region=RegionInFrame(e.region, frame)) for e in material.regions]
         conditions = [b.in_frame(frame) for b in solver.boundaries if isinstance(b, Boundary)]
         solver = changed(solver, boundaries=FixedList(conditions))
-        material, first = dataclasses.replace(material, regions=regions), camera and _seen(camera, frame)
-        further = {name: _seen(path, frame) for name, path in (cameras or {}).items()}
+        material, first = dataclasses.replace(material, regions=regions), camera and camera.in_space(frame)
+        further = {name: path.in_space(frame) for name, path in (cameras or {}).items()}
         changes = [dataclasses.replace(e, region=e.region and RegionInFrame(e.region, frame)) for e in edits]
         return scene, material, solver, first, further, changes
-
-
-def _seen(camera: CameraPath, frame: SimFrame) -> CameraPath:
-    """A camera path in scene units."""
-    return changed(camera, frame=frame) if isinstance(camera, PhysGaussianCamera) else camera
 
 
 if TYPE_CHECKING:

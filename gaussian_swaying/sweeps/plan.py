@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
 FIELDS = ("base", "settings", "axes", "draws", "seed")
-NOT_HERE = ("config", "output", "resume", "device", "preset", "physgaussian")
+NOT_HERE = ("config", "output", "resume", "device", "preset")
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_vector, check_whole
 from gaussian_swaying._fixed import Fixed
+from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.origin import NO_ORIGIN, Origin
 from gaussian_swaying.rendering.cameras.camera import (
     NEAR,
@@ -47,6 +48,10 @@ class CameraPath(Fixed, ABC):
         path = replace(self)  # type: ignore[type-var]
         path._origin = origin
         return path
+
+    def in_space(self, frame: SimFrame) -> CameraPath:
+        """The path of a simulation in another space than the scene's, from which a frame leads to scene units."""
+        return self
 
     def near_of(self, size: float) -> float:
         """Near plane for an object of a size [scene units]."""

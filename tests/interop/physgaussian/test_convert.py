@@ -16,15 +16,13 @@ from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.interop.physgaussian.camera import PhysGaussianCamera, read_model_camera
-from gaussian_swaying.interop.physgaussian.convert import convert, to_yaml
-from gaussian_swaying.interop.physgaussian.space import heading, rotation_matrix
+from gaussian_swaying.interop.physgaussian import PhysGaussianCamera, convert, heading, read_model_camera, to_yaml
 from gaussian_swaying.mpm.colliders import EnclosingBox, Plane, VelocityBox
 from gaussian_swaying.mpm.laws.law import lame_parameters
 from gaussian_swaying.mpm.laws.plastic import Foam, Metal, Plasticine, Sand, Snow
 from gaussian_swaying.mpm.pins import Handle, PinnedRegion, SequentialRelease
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.model import Normalisation
+from gaussian_swaying.simulation.model import Normalisation, rotation_matrix
 from gaussian_swaying.simulation.simulation import Simulation
 
 PARSER = Simulation.parser()
@@ -273,20 +271,19 @@ def test_published_numbers_of_single_conditions(tmp_path):
 
 
 def _ficus(tmp_path, **changes):
-    """A bar for a ficus as a file, and the published configuration with some changes."""
+    """A bar for a ficus as a file, and the published configuration with some changes, converted."""
     splat, config = tmp_path / "bar.ply", tmp_path / "ficus.json"
     write_ply(splat, plain_cloud(_bar()))
     config.write_text(json.dumps(PUBLISHED["ficus"] | changes))
-    return ["--physgaussian", str(config), "--scene.ply", str(splat), "--device", "cpu"]
+    assert convert_main([str(config), "--output", str(config.with_suffix(".yaml"))]) == 0
+    return ["--config", str(config.with_suffix(".yaml")), "--scene.ply", str(splat), "--device", "cpu"]
 
 
 def test_a_published_configuration_runs(tmp_path, capsys):
     """Two frames from the command line; options after the file override it; the stored configuration is complete."""
-    arguments = [*_ficus(tmp_path), "--frames", "2", "--frame_dt", "0.002", "--material.nu", "0.35"]
-    arguments += ["--camera.init_args.width", "32", "--camera.init_args.height", "18"]
     camera = {"init_azimuthm": -36.7, "init_elevation": 8.96, "init_radius": 4.11, "default_camera_index": -1}
-    arguments = [a.replace("ficus.json", "moving.json") for a in arguments]
-    (tmp_path / "moving.json").write_text(json.dumps(PUBLISHED["ficus"] | camera))
+    arguments = [*_ficus(tmp_path, **camera), "--frames", "2", "--frame_dt", "0.002", "--material.nu", "0.35"]
+    arguments += ["--camera.init_args.width", "32", "--camera.init_args.height", "18"]
     assert main([*arguments, "--output", str(tmp_path / "run")]) == 0
     streams = capsys.readouterr()
     assert "note: `substep_dt`" in streams.err
@@ -295,7 +292,7 @@ def test_a_published_configuration_runs(tmp_path, capsys):
     assert summary["frames"] == 2
     assert summary["lost_particles"] == 0
     assert summary["displacement_mean_max_m"] > 0
-    assert summary["config"] == [str(tmp_path / "moving.json")]
+    assert summary["config"] == [str(tmp_path / "ficus.yaml")]
     stored = yaml.safe_load((tmp_path / "run/config.yaml").read_text())
     assert stored["material"]["nu"] == 0.35
     assert stored["frame_dt"] == 0.002
@@ -821,9 +818,6 @@ def test_the_command_writes_what_sim_reads(tmp_path, capsys):
     assert "&" not in streams.out  # every part is written out
     settings = PARSER.parse_args(["--config", str(output), "--scene.ply", "splat.ply"])
     assert settings.material.law.init_args.friction_angle == 30.0
-    direct = PARSER.parse_args(["--physgaussian", str(config), "--scene.ply", "splat.ply"])
-    settings.config = direct.config = None
-    assert direct == settings
     output.unlink()
     config.write_text(json.dumps({"g": STILL, "densty": 1}))
     refused(

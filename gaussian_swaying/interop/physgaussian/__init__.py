@@ -1,1 +1,0 @@
-"""PhysGaussian's configurations, space and camera."""
