@@ -13,6 +13,7 @@ from torch import nn
 
 from gaussian_swaying._fixed import Fixed, version
 from gaussian_swaying.kernels.language import INTERPRETED
+from gaussian_swaying.kernels.launch import call
 
 RECORDED = 200_000
 """Most particles or Gaussians for which the kernels of their fields are recorded: CUDA graphs keep their memory."""
@@ -134,7 +135,13 @@ class Repeater:
         self._stream: torch.cuda.Stream | None = None
 
     def run(
-        self, times: int, key: Hashable, several: Callable[[int], None], recordable: bool = True, launches: bool = False
+        self,
+        times: int,
+        key: Hashable,
+        work: Callable[[int], None],
+        recordable: bool = True,
+        launches: bool = False,
+        counter: torch.Tensor | None = None,
     ) -> None:
         """Run the work ``times`` times.
 
@@ -144,13 +151,21 @@ class Repeater:
         Args:
             times: Number of repetitions.
             key: Identifies the work.
-            several: ``several(n)`` runs it n times.
+            work: Runs it once; its argument is how often it ran since ``counter`` changed.
             recordable: Whether it may be recorded.
             launches: Whether it consists of launches of kernels, and of calls by ``kernels.launch.call``; only then is
                 it recorded on a CPU.
+            counter: A whole number on the device that is to grow by one each time.
         """
         if times == 0:  # nothing runs, so nothing is compiled
             return
+
+        def several(count: int) -> None:
+            for offset in range(count):
+                work(offset)
+            if counter is not None:
+                call(lambda: counter.add_(count), self.device)
+
         if self.device.type == "cpu" and launches and not INTERPRETED:
             self._run_on_cpu(times, key, several)
             return

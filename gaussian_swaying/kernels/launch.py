@@ -13,6 +13,9 @@ from torch import Tensor
 
 from gaussian_swaying.kernels.language import INTERPRETED, Compiler, tl, triton
 
+MAX_INDEX = 2**31
+"""Number of entries of a buffer that kernels can address, with 32-bit indices."""
+
 LANES = 8
 """Lanes of a program on a CPU."""
 

@@ -152,15 +152,17 @@ def as_forces(forces: Forces | None) -> tuple[Force, ...]:
     return tuple(force if isinstance(force, Force) else FunctionForce(force) for force in several)
 
 
-def split(found: Given, force: Force, state: State) -> tuple[Tensor, Tensor | None]:
+def split(found: Any, force: Force, state: State) -> tuple[Tensor | None, Tensor | None]:
     """Split the result of a force into the force and its resistance or None, in the dtype of the state."""
     value, drag = found if isinstance(found, tuple) else (found, None)
     name, like = type(force).__name__, state.position
-    check_shape(f"force of {name}", value, like.shape[-2], 3)
+    if value is not None or drag is None:
+        check_shape(f"force of {name}", value, like.shape[-2], 3)
+        value = _converted(f"force of {name}", value, like)
     if drag is not None:
         check_shape(f"resistance of {name}", drag, like.shape[-2])
         drag = _converted(f"resistance of {name}", drag, like)
-    return _converted(f"force of {name}", value, like), drag
+    return value, drag
 
 
 def _converted(name: str, value: Tensor, like: Tensor) -> Tensor:
@@ -188,6 +190,6 @@ def tensors_of(forces: Sequence[Force]) -> list[Tensor]:
 def divide(forces: Sequence[Force]) -> tuple[tuple[Force, ...], list[DeviceFunction], tuple[Force, ...]]:
     """The forces that have a device function, their device functions, and the others, which run in torch."""
     found = [(force, force.device_function()) for force in forces]
-    fused = tuple(force for force, own in found if own is not None)
+    here = tuple(force for force, own in found if own is not None)
     asked = tuple(force for force, own in found if own is None)
-    return fused, [own for _, own in found if own is not None], asked
+    return here, [own for _, own in found if own is not None], asked

@@ -101,8 +101,6 @@ def check_end(
     dt: float,
     steps: int,
     forces: Sequence[Force],
-    force: Tensor | None = None,
-    drag: Tensor | None = None,
 ) -> None:
     """Raise an error if the state after a rollout is not valid (one GPU synchronisation).
 
@@ -113,8 +111,6 @@ def check_end(
         dt: Substep [s].
         steps: Number of substeps.
         forces: The forces that acted; called once more, for the first substep, if something is NaN.
-        force: The force that was given to ``MPMSolver.step`` [N], shape (..., P, 3), or None.
-        drag: Its resistance [kg/s], shape (..., P), or None.
     """
     check_pace(dt, bound.obstacle_cells(before, steps * dt), "dt")
     fields = {"position": after.position, "velocity": after.velocity, "deformation": after.F_elastic.flatten(-2)}
@@ -134,7 +130,7 @@ def check_end(
         ("displacement of node", before.node_displacement),
         ("velocity of node", before.node_velocity),
     ]
-    given += [("`force` on particle", force), ("`drag` of particle", drag), *_loads(forces, before, dt, steps)]
+    given += _loads(forces, before, dt, steps)
     for name, value in given:
         if value is not None and not bool(torch.isfinite(value).all()):
             bad = ~torch.isfinite(value if value.dim() > before.lost.dim() else value[..., None])

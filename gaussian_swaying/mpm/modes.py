@@ -341,6 +341,7 @@ class Modes(Total):
         for _ in range(rounds):
             seen = self._site_state(self.site_modes @ torch.stack([q, p], -1), state.time)
             load, _ = split(group(seen), group, seen)
+            assert load is not None
             q = 0.5 * (q + self._pull(seen.F_total, load) / square)
         return self.shown(state, q, p)
 
@@ -380,7 +381,7 @@ class Modes(Total):
             now = self.shown(state.replace(time=time), q, p)
             turn = self._everywhere(_vectors(self.turn, q[..., None])[..., 0])
             load, drag = added([split(force(now), force, now) for force in others])
-            assert load is not None
+            load = torch.zeros_like(now.velocity) if load is None else load
             pulled = self._project(_turned(rotation_of(-turn), scatter(self.stencil, load[..., None, :])))
             if drag is None:
                 return pulled, None, self.at_sites(load)

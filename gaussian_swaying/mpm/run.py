@@ -1,7 +1,7 @@
 """Runs substeps with the Triton kernels: buffers, forces, CUDA graphs.
 
 ``MPMSolver`` uses it instead of the torch substep of a formulation if no gradient is needed; the torch substep is the
-reference. Each formulation has a subclass of :class:`Fused`.
+reference. Each formulation has a subclass of :class:`Run`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from gaussian_swaying.kernels.graphs import Repeater, recorded_key
 from gaussian_swaying.kernels.language import INTERPRETED
-from gaussian_swaying.kernels.launch import call, compiles, lanes, launch
+from gaussian_swaying.kernels.launch import MAX_INDEX, call, compiles, lanes, launch
 from gaussian_swaying.mpm import shared_kernels as kernels
 from gaussian_swaying.mpm.device_functions import DeviceFunction, Packed
 from gaussian_swaying.mpm.dispatch import BodyLaws, in_common
@@ -29,9 +29,6 @@ from gaussian_swaying.mpm.timestep import kick_time
 
 MAX_STEPS = MOST_STEPS
 """Number of substeps whose schedule fits in the buffers; longer rollouts are run in parts."""
-
-MAX_INDEX = 2**31
-"""Number of entries of a buffer that the kernels can address, with 32-bit indices."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +50,7 @@ class Part:
     key: tuple[object, ...] | None
 
 
-class Fused(ABC):
+class Run(ABC):
     """Substeps of a formulation bound to its material.
 
     Args:
@@ -167,7 +164,7 @@ class Fused(ABC):
         """
         with at_home(self.speed):
             self.speed.zero_()
-            fused, device_functions, self.asked = divide(forces)
+            here, device_functions, self.asked = divide(forces)
             options = self.options_for(device_functions)
             options["FORCE"] = len(self.asked) > 0 or force is not None or drag is not None
             options["IMPLICIT"] = options["IMPLICIT"] or drag is not None or self._resists(state)
@@ -183,7 +180,7 @@ class Fused(ABC):
                 self.schedule[: count + 2].copy_(self.table(kick_time(state, dt), dt, count), non_blocking=True)
                 self.time.copy_(state.time)
                 self.dt.fill_(dt)
-                changes = self._run(state, Part(count, options, marks, loaded, self._key_of(fused)))
+                changes = self._run(state, Part(count, options, marks, loaded, self._key_of(here)))
                 changes["impulse"] = state.impulse + changes["impulse"]
                 work = changes.pop("work", 0.0) if forces or force is not None else 0.0  # not that of a drag alone
                 changes |= {"work": state.work + work, "time": state.time + count * dt, "substep": dt}
@@ -225,8 +222,8 @@ class Fused(ABC):
 
     def _key_of(self, forces: Sequence[Force]) -> tuple[object, ...] | None:
         """Return the key of the recorded numbers of forces with device functions; None if they cannot be recorded."""
-        here = all(tensor.device == self.device for tensor in tensors_of(forces))
-        recordable = here and all(force.recordable for force in forces)
+        near = all(tensor.device == self.device for tensor in tensors_of(forces))
+        recordable = near and all(force.recordable for force in forces)
         return (self.loads.layout, *recorded_key(forces)) if recordable else None
 
     def places(self) -> tuple[int, int]:
@@ -319,20 +316,9 @@ class Fused(ABC):
         call(lambda: time.add_(dt), self.device)
 
     def repeat(self, steps: int, key: Any, body: Callable[[int], None]) -> None:
-        """Run ``body(offset)``, one substep, for each offset, from graphs if there are any.
-
-        The first time a key is seen, the substeps run without a graph, which compiles what is not yet compiled; the
-        second time, they are recorded.
-        """
-        first = self.first_step  # what is recorded must not hold this object, which holds the recordings
-
-        def several(count: int) -> None:
-            for offset in range(count):
-                body(offset)
-            call(lambda: first.add_(count), self.device)
-
+        """Run ``body(offset)``, one substep, for each offset, from recordings if there are any."""
         whole = (key, self.places(), self._asked_key())
-        self.repeater.run(steps, whole, several, self.recordable, self.launches and not self.asked)
+        self.repeater.run(steps, whole, body, self.recordable, self.launches and not self.asked, self.first_step)
 
 
 @contextmanager
@@ -352,4 +338,4 @@ def check_indices(entries: int) -> None:
 
 
 def _nothing() -> None:
-    """Return None: the placeholder for a Fused in a copy."""
+    """Return None: the placeholder for a Run in a copy."""

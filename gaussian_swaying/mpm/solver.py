@@ -25,25 +25,16 @@ from gaussian_swaying.mpm.formulation import Formulation, Settings, flowing
 from gaussian_swaying.mpm.guard import check_begin, check_end, check_load, check_rest
 from gaussian_swaying.mpm.modes import Modes, why_not_modes
 from gaussian_swaying.mpm.protocol import Solver, WatchFunction
+from gaussian_swaying.mpm.run import Run
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
 from gaussian_swaying.mpm.timestep import check_pace, fixed_substeps, look_marks, substeps_per_frame, work_done
 from gaussian_swaying.mpm.total import Total
-from gaussian_swaying.mpm.updated import Updated
+from gaussian_swaying.mpm.total_adjoint import TotalAdjoint
+from gaussian_swaying.mpm.updated import Updated, UpdatedRun
 
 FORMULATIONS: dict[str, type[Formulation]] = {kind.name: kind for kind in (Total, Updated, Modes)}
-Fused = Any
-"""A ``mpm.run.Fused``; not imported even for its type, as the parser resolves types and Triton takes 0.1 s."""
-
-
-def _kernels_of(bound: Formulation) -> Any:
-    """The class that runs a formulation in kernels."""
-    if isinstance(bound, Total):
-        from gaussian_swaying.mpm.total_adjoint import TotalAdjoint
-
-        return TotalAdjoint
-    from gaussian_swaying.mpm.updated_run import UpdatedRun
-
-    return UpdatedRun
+RUNS: dict[str, type[Run]] = {"total": TotalAdjoint, "updated": UpdatedRun}
+"""What runs each in kernels."""
 
 
 class MPMSolver(Fixed, Solver):
@@ -127,7 +118,7 @@ class MPMSolver(Fixed, Solver):
         # the same in metres; in a tuple, because these copies do not belong to the module's state
         self._framed: tuple[Boundary, ...] | None = None
         self._bound: Formulation | None = None
-        self._fused: Fused = None
+        self._kernels: Any = None
         self._obstacle: str | None = None
 
     # ---- settings
@@ -183,7 +174,7 @@ class MPMSolver(Fixed, Solver):
 
     def prepare(self) -> None:
         """Make the kernels, if they are used; their errors are raised here."""
-        self.fused()
+        assert self.kernels is not None or not self.has_kernels
 
     def like(self, settings: Settings) -> MPMSolver:
         """A solver with the same boundaries and other numbers, without a material.
@@ -249,7 +240,7 @@ class MPMSolver(Fixed, Solver):
         return self
 
     def _bind(self, points: MaterialPoints, surface: Surface | None) -> None:
-        self._bound = self._fused = None
+        self._bound = self._kernels = None
         boundaries = self._framed or self.framed(None)
         if self.may_choose:
             formulation, why = self._choice(points, boundaries, surface)
@@ -280,9 +271,9 @@ class MPMSolver(Fixed, Solver):
         """Return the reason why no kernels are used, if so; ValueError if none can be, but ``transfer`` is kernels."""
         if self.transfer == "torch":
             return "`transfer` is torch"
-        obstacle = f"the {bound.name} formulation has no kernels"
-        if not isinstance(bound, Modes):
-            obstacle = _kernels_of(bound).unsupported(bound, interpret=self.transfer == "kernels")
+        obstacle: str | None = f"the {bound.name} formulation has no kernels"
+        if bound.name in RUNS:
+            obstacle = RUNS[bound.name].unsupported(bound, interpret=self.transfer == "kernels")
         if self.transfer == "kernels" and obstacle is not None:
             raise ValueError(f"`transfer: kernels` cannot be used, because {obstacle}: set it to auto or torch.")
         return obstacle
@@ -297,37 +288,19 @@ class MPMSolver(Fixed, Solver):
         """True if the substep of the kernels is used where no gradient is needed."""
         return self._bound is not None and self._obstacle is None
 
-    def fused(self, *tensors: Tensor | None) -> Fused:
-        """The compiled substep of this material; None if the torch substep is used.
-
-        Args:
-            tensors: Inputs of the substep; if one of them requires a gradient, the torch substep is used.
-
-        Raises:
-            ValueError: If ``transfer`` is kernels and a gradient is required.
-        """
-        if self.has_kernels and not self._wanted(*tensors):
-            return self._kernels()
-        if self.transfer == "kernels":
-            raise ValueError("`transfer: kernels` has no gradients here: set it to auto or torch.")
-        return None
+    @property
+    def kernels(self) -> Any:
+        """The ``mpm.run.Run`` of this material, made when it is first asked for; None where torch runs all substeps."""
+        if self._kernels is None and self.has_kernels:
+            # ordinary tensors, which can be written inside and outside inference mode
+            with torch.inference_mode(False), torch.no_grad():
+                self._kernels = RUNS[self.bound.name](self.bound)
+        return self._kernels
 
     def _wanted(self, *tensors: Tensor | None) -> bool:
         """True if the body or one of some tensors requires a gradient, and gradients are enabled."""
         asking = (*self.bound.tensors(), *tensors)
         return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in asking)
-
-    def _replays(self, state: MPMState, forces: Sequence[Force]) -> bool:
-        """True if kernels run whole rollouts: no gradient is wanted, and the host need not call a force."""
-        wanted = self.has_kernels and self._wanted(*state.tensors(), *tensors_of(forces))
-        return self.has_kernels and not wanted and all(f.recordable or f.device_function() is not None for f in forces)
-
-    def _kernels(self) -> Fused:
-        if self._fused is None:
-            # ordinary tensors, which can be written inside and outside inference mode
-            with torch.inference_mode(False), torch.no_grad():
-                self._fused = _kernels_of(self.bound)(self.bound)
-        return self._fused
 
     def init_state(
         self,
@@ -403,8 +376,8 @@ class MPMSolver(Fixed, Solver):
 
     def cells_per_second(self, state: MPMState) -> Tensor:
         """Return the cells that the fastest wave crosses per second, a scalar tensor; in a kernel if there is one."""
-        kernels = self.has_kernels and self._kernels().watches
-        return self._kernels().largest_speed(state) if kernels else self.bound.cells_per_second(state)
+        watches = self.has_kernels and self.kernels.watches
+        return self.kernels.largest_speed(state) if watches else self.bound.cells_per_second(state)
 
     def fit_grid(self, state: MPMState, horizon: float, margin: int = 0) -> MPMState:
         """Fit the grid of the ``updated`` formulation to the object for the next ``horizon`` seconds.
@@ -456,26 +429,13 @@ class MPMSolver(Fixed, Solver):
         check_begin(self.bound, state, dt, 1)
         check_load(self.bound, force, drag)
         acting = as_forces(forces)
-        waits = not state.position.is_cuda
-        if force is None and drag is None:
-            return self.rollout(state, dt, 1, acting, check=waits)
-        if isinstance(self.bound, Modes):
-            given = FunctionForce(
-                lambda state: (force if force is not None else torch.zeros_like(state.position), drag)
-            )
-            return self.rollout(state, dt, 1, (*acting, given), check=waits)
-        found = [split(part(state), part, state) for part in acting]
-        end = self._step(state, dt, *added([(force, drag), *found]))
-        if waits:
-            check_end(self.bound, state, end, dt, 1, acting, force, drag)
-        return end
+        if force is not None or drag is not None:
 
-    def _step(self, state: MPMState, dt: float, force: Tensor | None, drag: Tensor | None) -> MPMState:
-        fused = self.fused(*state.tensors(), force, drag)
-        if fused is not None:
-            return fused.rollout(state, dt, 1, force=force, drag=drag)[0]
-        after = self.bound.step(state, dt, force, drag)
-        return after if force is None else after.replace(work=work_done(state, after, dt, force, drag))
+            def step(_: Any) -> Any:
+                return force, drag
+
+            acting = (FunctionForce(step), *acting)
+        return self.rollout(state, dt, 1, acting, check=not state.position.is_cuda)
 
     def rollout(
         self,
@@ -519,38 +479,50 @@ class MPMSolver(Fixed, Solver):
             FloatingPointError: If a particle became NaN or infinite.
         """
         acting, steps = as_forces(forces), check_begin(self.bound, state, dt, steps, check)
-        end = self._rollout(state, dt, steps, acting, checkpoint, watch)
+        wanted = self._wanted(*state.tensors(), *tensors_of(acting))
+        if isinstance(self.bound, Modes):
+            end = self.bound.rollout(state, dt, steps, acting, watch)
+        elif self.has_kernels and not wanted and all(map(self._replayed, acting)):
+            end = self.kernels.rollout(state, dt, steps, acting, watch=watch)[0]
+        elif self.has_kernels and wanted and (why := self.kernels.why_no_gradient(state, acting)) is None:
+            end = self.kernels.rollout_with_gradient(state, dt, steps, acting, checkpoint, watch)
+        elif self.transfer == "kernels" and wanted:
+            raise ValueError(f"`transfer: kernels` has no gradients here, because {why}: set it to auto or torch.")
+        else:
+            end = self._one_by_one(state, dt, steps, acting, checkpoint, watch)
         if check:
             check_end(self.bound, state, end, dt, steps, acting)
         return end
 
-    def _rollout(
+    @staticmethod
+    def _replayed(force: Force) -> bool:
+        """True if the host need not call a force in every substep."""
+        return force.recordable or force.device_function() is not None
+
+    def _one_by_one(
         self,
         state: MPMState,
         dt: float,
         steps: int,
         acting: Sequence[Force],
-        checkpoint: int = 0,
-        watch: WatchFunction | None = None,
+        checkpoint: int,
+        watch: WatchFunction | None,
     ) -> MPMState:
-        """As :meth:`rollout`, without checks."""
-        if isinstance(self.bound, Modes):
-            return self.bound.rollout(state, dt, steps, acting, watch)
-        if self._replays(state, acting):
-            return self._kernels().rollout(state, dt, steps, acting, watch=watch)[0]
-        if self.has_kernels and self._wanted(*state.tensors(), *tensors_of(acting)):
-            why = self._kernels().why_no_gradient(state, acting)
-            if why is None:
-                return self._kernels().rollout_with_gradient(state, dt, steps, acting, checkpoint, watch)
-            if self.transfer == "kernels":
-                raise ValueError(f"`transfer: kernels` has no gradients here, because {why}: set it to auto or torch.")
+        """Substeps between which the host calls the forces, in kernels or, where gradients are wanted, in torch."""
         sources = [force.during(state.time, dt, steps) for force in acting]
 
         def advance(state: MPMState, first: int, count: int) -> MPMState:
             for k in range(first, first + count):
                 pairs = zip(sources, acting, strict=True)
-                found = [split(source(state, k), force, state) for source, force in pairs]
-                state = self._step(state, dt, *added(found))
+                force, drag = added([split(source(state, k), force, state) for source, force in pairs])
+                if self.has_kernels and not self._wanted(*state.tensors(), force, drag):
+                    state = self.kernels.rollout(state, dt, 1, force=force, drag=drag)[0]
+                elif self.transfer == "kernels":
+                    raise ValueError("`transfer: kernels` has no gradients here: set it to auto or torch.")
+                else:
+                    after = self.bound.step(state, dt, force, drag)
+                    done = None if force is None else work_done(state, after, dt, force, drag)
+                    state = after if done is None else after.replace(work=done)
                 if watch is not None and checkpoint <= 0:
                     watch(k + 1)
             return state
@@ -588,13 +560,15 @@ class MPMSolver(Fixed, Solver):
         """
         acting, steps = as_forces(forces), check_begin(self.bound, state, dt, steps, check)
         marks, end, seen = [steps] if self.exact else look_marks(steps, looks), state, []
-        if self._replays(state, acting) and self.stiffness_damping == 0 and self._kernels().watches:
-            end, cells = self._kernels().rollout(state, dt, steps, acting, looks=marks, watch=watch)
+        wanted = self._wanted(*state.tensors(), *tensors_of(acting))
+        replayed = self.has_kernels and not wanted and all(map(self._replayed, acting))
+        if replayed and self.stiffness_damping == 0 and self.kernels.watches:
+            end, cells = self.kernels.rollout(state, dt, steps, acting, looks=marks, watch=watch)
             seen.append(dt * cells)
         else:
             for first, last in pairwise([0, *marks]):
                 part = None if watch is None else lambda done, before=first: watch(before + done)
-                end = self._rollout(end, dt, last - first, acting, watch=part)
+                end = self.rollout(end, dt, last - first, acting, watch=part, check=False)
                 seen.append(self.cfl_number(end, dt))
         if check:
             check_end(self.bound, state, end, dt, steps, acting)
@@ -606,7 +580,7 @@ class MPMSolver(Fixed, Solver):
         if known is not None:
             return known
         F, kernels = state.F_elastic, self.has_kernels and not self._wanted(state.F_elastic)
-        density = self._kernels().energy(F) if kernels else None
+        density = self.kernels.energy(F) if kernels else None
         if density is None:
             density = self.laws.energy(F, state.internal)
         return (self.points.volume * density).sum(-1) + self.bound.sheet_energy(state)

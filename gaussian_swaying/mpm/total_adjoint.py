@@ -33,8 +33,8 @@ from gaussian_swaying.mpm.shared_kernels import VARIES, axis_weights, node_weigh
 from gaussian_swaying.mpm.sheets import flattened, sheet_stress, without_normal
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.mpm.timestep import kick_time
+from gaussian_swaying.mpm.total import REGISTERS, TotalRun
 from gaussian_swaying.mpm.total_kernels import cells_of, gather, law_row, load_particles, motion
-from gaussian_swaying.mpm.total_run import REGISTERS, TotalRun
 from gaussian_swaying.mpm.transfer import gather as gather_rows
 
 _SHAPED = {"flat": 9, "m": 3, "area": 0, "thickness": 0, "thinning": 0}

@@ -94,10 +94,11 @@ def test_regions_say_for_themselves_whether_they_can_be_recorded():
 
 
 def test_work_runs_as_often_as_asked_without_cuda():
-    done, repeater = [], Repeater(torch.device("cpu"))
+    done, count, repeater = [], torch.zeros(1), Repeater(torch.device("cpu"))
     for times in (0, 1, 23):
-        repeater.run(times, "key", done.append)
-    assert sum(done) == 24
+        repeater.run(times, "key", done.append, counter=count)
+    assert done == [0] * 24
+    assert float(count) == 24
 
 
 def test_a_function_without_cuda_is_called():
@@ -115,21 +116,28 @@ def test_work_is_recorded_from_the_second_time_on_and_after_forgetting():
     total, called = torch.zeros(1, device=device), []
     repeater = Repeater(device)
 
-    def several(n):
-        called.append(n)
-        total.add_(n)
+    count = torch.zeros_like(total)
+
+    def work(offset):
+        called.append(offset)
+        total.add_(1 + offset)
+
+    def called_for(sizes):
+        return [offset for size in sizes for offset in range(size)]
 
     for times in (3, 23, 23):
-        repeater.run(times, "key", several)
-    assert called == [1, 1, 1, 16, 4, 1]  # as it is three times, then one recording of each size
+        repeater.run(times, "key", work, counter=count)
+    assert called == called_for([1, 1, 1, 16, 4, 1])  # as it is three times, then one recording of each size
     repeater.forget()
+    called.clear()
     for times in (1, 5):
-        repeater.run(times, "key", several)
-    assert called[6:] == [1, 4, 1]
-    repeater.run(1, "other", several, recordable=False)
-    repeater.run(1, "other", several, recordable=False)
-    assert called[9:] == [1, 1]
-    assert float(total) == 3 + 23 + 23 + 1 + 5 + 2
+        repeater.run(times, "key", work, counter=count)
+    assert called == called_for([1, 4, 1])
+    for _ in range(2):
+        repeater.run(1, "other", work, recordable=False)
+    assert called[6:] == [0, 0]
+    assert float(count) == 3 + 23 + 23 + 1 + 5
+    assert float(total) == 3 + 2 * (136 + 10 + 3) + 1 + (10 + 1) + 2
 
 
 @pytest.mark.gpu

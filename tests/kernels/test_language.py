@@ -64,7 +64,7 @@ print(INTERPRETED, ON_GPU, isinstance(triton, Compiler), "triton" in sys.modules
 """
 
 
-def _ask(module="gaussian_swaying.mpm.total_run", **environment):
+def _ask(module="gaussian_swaying.mpm.total", **environment):
     given = {**os.environ, "CUDA_VISIBLE_DEVICES": "", "PYTHONPATH": str(ROOT), **environment}
     made = subprocess.run(
         [sys.executable, "-c", ASK.format(module=module)], env=given, capture_output=True, text=True, check=False

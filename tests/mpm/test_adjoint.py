@@ -18,7 +18,7 @@ from gaussian_swaying import (
     WindField,
     WindForce,
 )
-from gaussian_swaying.mpm import total_run
+from gaussian_swaying.mpm import total
 from gaussian_swaying.mpm.colliders import BallObstacle, Plane
 from gaussian_swaying.wind.force import LAWS as WIND_LAWS
 from gaussian_swaying.wind.patches import Patches
@@ -29,7 +29,7 @@ WIDE = torch.float64
 @pytest.fixture(autouse=True)
 def _one_width(monkeypatch):
     """The number of lanes is a constant of the compiled kernel: the same for all bodies."""
-    monkeypatch.setattr(total_run, "_lanes", lambda sizes: 4)
+    monkeypatch.setattr(total, "_lanes", lambda sizes: 4)
 
 
 def _random(seed, *shape):
@@ -198,7 +198,7 @@ def test_gradients_without_wind(kernel_device):
 
 def test_gradients_where_cells_are_cut(kernel_device, monkeypatch):
     """Crowded cells are cut into pieces, whose sums are joined."""
-    monkeypatch.setattr(total_run, "_lanes", lambda sizes: 2)
+    monkeypatch.setattr(total, "_lanes", lambda sizes: 2)
     _compare(kernel_device, ELASTIC["corotated"], steps=3)
 
 

@@ -105,9 +105,9 @@ class _Broken(Force):
 def test_what_is_given_as_nan_is_named(formulation):
     solver, state = _solver(formulation)
     bad = _broken(27, 3)
-    with pytest.raises(ValueError, match="the `force` on particle 7 is NaN"):
+    with pytest.raises(ValueError, match="the force of step on particle 7 is NaN"):
         solver.step(state, DT, force=bad)
-    with pytest.raises(ValueError, match="the `drag` of particle 7 is NaN"):
+    with pytest.raises(ValueError, match="the resistance of step of particle 7 is NaN"):
         solver.step(state, DT, force=torch.zeros_like(bad), drag=bad[:, 0])
     for call in (solver.rollout, solver.watched_rollout):
         with pytest.raises(ValueError, match="the force of _Broken on particle 7 is NaN"):

@@ -32,7 +32,7 @@ def test_together_is_as_alone(tmp_path, sweep_file):
     settings = {"solver.substep": 2e-3, "frames": 5}
     together, members = _batch(tmp_path, sweep_file(tmp_path / "tiny.yaml", settings=settings))
     state = together.start()
-    assert together.solver.fused() is not None
+    assert together.solver.kernels is not None
     for _ in range(4):
         frame = together.launch(state)
         state, _ = frame.finish()

@@ -122,7 +122,7 @@ def test_what_asks_for_a_gradient_is_not_left_to_the_kernels(name, monkeypatch):
     owner = {"C_D": load.aero, "flows": load.wind}.get(name, load)
     getattr(owner, name).requires_grad_()
     asked = []
-    monkeypatch.setattr(MPMSolver, "fused", lambda solver, *tensors: asked.append(tensors))
+    monkeypatch.setattr(MPMSolver, "_wanted", lambda solver, *tensors: asked.append(tensors))
     for roll in (solver.rollout, solver.watched_rollout):
         asked.clear()
         roll(state, DT, 1, load)
@@ -332,8 +332,8 @@ def test_a_changed_effect_is_read_again_at_the_same_address(kernel_device):
             assign(load.wind, flows=load.wind.flows.flip(0))
         ends.append(solver.rollout(state, DT, 5, load))
         _same(ends[-1], reference.rollout(state, DT, 5, load))
-        where = where or solver.fused().loads.buffer.data_ptr()
-        assert solver.fused().loads.buffer.data_ptr() == where
+        where = where or solver.kernels.loads.buffer.data_ptr()
+        assert solver.kernels.loads.buffer.data_ptr() == where
     assert_close(ends[0].position, ends[1].position, rtol=0, atol=1e-6)
     for one, other in ((1, 2), (2, 3)):
         assert (ends[one].velocity - ends[other].velocity).abs().max() > 1e-3

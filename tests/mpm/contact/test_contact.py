@@ -135,14 +135,14 @@ def test_the_lists_do_not_change_the_result(monkeypatch):
     solver, state = scene(points, Contact(), velocity=velocity, gravity=(0, 0, 0))
     still = state.replace(velocity=0 * velocity, node_velocity=0 * state.node_velocity)
     solver.rollout(still, 1e-4, 8)
-    assert solver.fused().touching.interval == 64
+    assert solver.kernels.touching.interval == 64
     known = solver.rollout(state, 5e-4, 160)
-    assert 1 < solver.fused().touching.interval < 64
-    monkeypatch.setattr("gaussian_swaying.mpm.contact_run.LONGEST", 1)
+    assert 1 < solver.kernels.touching.interval < 64
+    monkeypatch.setattr("gaussian_swaying.mpm.contact.LONGEST", 1)
     other, state = scene(points, Contact(), velocity=velocity, gravity=(0, 0, 0))
     other.rollout(still, 1e-4, 1)
     again = other.rollout(state, 5e-4, 160)
-    assert other.fused().touching.interval == 1
+    assert other.kernels.touching.interval == 1
     assert_close(again.position, known.position, rtol=0, atol=1e-10)
     assert float((known.velocity - velocity).abs().max()) > 1.0  # they touched
 

@@ -7,7 +7,7 @@ from torch.testing import assert_close
 
 from gaussian_swaying import Contact, MaterialPoints, PinnedPoints
 from gaussian_swaying.kernels.derive import on_tensors
-from gaussian_swaying.mpm import contact_kernels, contact_run
+from gaussian_swaying.mpm import contact, contact_kernels
 from gaussian_swaying.mpm.colliders import BallObstacle, HalfSpaceObstacle
 
 from .bodies import scene, sheet
@@ -70,7 +70,7 @@ def _ends(device, contact, *parts, speed=1.0):
 def test_a_collision_is_the_same_in_float32_and_float64(device, iterations):
     """Four substeps of free flight and two of collision; round-off grows in it, but not to a thousandth of it."""
     single, double, solver = _ends(device, Contact(friction=0.1, iterations=iterations), 4, 2)  # they slide
-    assert solver.fused().touching.rounds > 0
+    assert solver.kernels.touching.rounds > 0
     (position, speed, taken), (expected, speeds, impulse) = single[1], double[1]
     changed = float((speed - single[0][1]).abs().max())
     assert changed > 5.0
@@ -91,7 +91,7 @@ def test_iterations_are_counted_where_there_are_obstacles(device):
     ground = HalfSpaceObstacle([0.0, 0.0, -0.004], [0.0, 0.0, 1.0])
     solver, state = scene(points, Contact(iterations=1), [ground], transfer="kernels", gravity=(0.0, 0.0, -9.8))
     solver.rollout(state, DT, 6)
-    assert solver.fused().touching.rounds == 6
+    assert solver.kernels.touching.rounds == 6
 
 
 def test_the_lists_are_those_of_a_tree(device):
@@ -104,8 +104,8 @@ def test_the_lists_are_those_of_a_tree(device):
     moved[upper] = torch.tensor([0.013, -0.007, 0.01 - 0.4], device=device)
     state = solver.bound.read_particles(state, moved, 0 * moved)
     solver.rollout(state, 1e-5, 1)
-    touching, stage = solver.fused().touching, solver.bound.contact
-    limit = stage.reach + contact_run.SLACK * stage.dx + touching.margin
+    touching, stage = solver.kernels.touching, solver.bound.contact
+    limit = stage.reach + contact.SLACK * stage.dx + touching.margin
     both = pairs(stage, samples(stage, state)[0], limit)
     assert both.shape[1] > 200
     assert touching.pairs == both.shape[1]
@@ -130,8 +130,8 @@ def test_nodes_without_weight_do_not_widen_the_lists(device):
     velocity = torch.where(light[:, None], 1000.0, 0.0).expand(-1, 3)
     state = solver.bound.read_particles(state, torch.zeros_like(velocity), velocity)
     solver.rollout(state, 1e-5, 3)
-    touching = solver.fused().touching
-    assert touching.margin == contact_run.REACHES * solver.bound.contact.reach
+    touching = solver.kernels.touching
+    assert touching.margin == contact.REACHES * solver.bound.contact.reach
     assert touching.interval > 1
 
 
@@ -140,13 +140,13 @@ def test_lists_that_do_not_fit_get_more_room(device, monkeypatch):
     points, velocity, _ = _collision(device)
     ends, rooms = [], []
     for room, slots in ((64, 32), (2, 1)):
-        monkeypatch.setattr(contact_run, "ROOM", room)
-        monkeypatch.setattr(contact_run, "SLOTS", slots)
+        monkeypatch.setattr(contact, "ROOM", room)
+        monkeypatch.setattr(contact, "SLOTS", slots)
         # torch makes the masses of the nodes, on a GPU in no fixed order unless told to
         settings = {"transfer": "kernels", "deterministic": True}
         solver, state = scene(points, Contact(iterations=2), velocity=velocity, **settings)
         ends.append(solver.rollout(state, 4 * DT, 2))
-        rooms.append((solver.fused().touching.room, solver.fused().touching.slots))
+        rooms.append((solver.kernels.touching.room, solver.kernels.touching.slots))
     assert rooms[0] == (64, 32)
     assert rooms[1][0] > 2
     assert rooms[1][1] > 1
@@ -157,18 +157,18 @@ def test_lists_that_do_not_fit_get_more_room(device, monkeypatch):
 
 def test_material_that_has_collapsed_is_refused(device, monkeypatch):
     """More candidates than any buffer holds: a sentence, not wrong lists, and another rollout is possible."""
-    monkeypatch.setattr(contact_run, "ROOM", 2)
+    monkeypatch.setattr(contact, "ROOM", 2)
     points, velocity, _ = _collision(device)
     solver, state = scene(points, Contact(iterations=1), velocity=velocity, transfer="kernels")
-    monkeypatch.setattr(contact_run, "MOST_ENTRIES", 1000 * points.count)
-    solver.fused()
-    monkeypatch.setattr(contact_run, "MOST_ENTRIES", 100)
-    touching = solver.fused().touching
+    monkeypatch.setattr(contact, "MOST_ENTRIES", 1000 * points.count)
+    solver.prepare()
+    monkeypatch.setattr(contact, "MOST_ENTRIES", 100)
+    touching = solver.kernels.touching
     with pytest.raises(ValueError, match="the material has collapsed"):
         solver.rollout(state, 4 * DT, 1)
     assert touching.candidates.shape == (touching.places, touching.room)  # kernels would write beside them
     assert touching.other.shape == (touching.slots, touching.places)
-    monkeypatch.setattr(contact_run, "MOST_ENTRIES", 1000 * points.count)
+    monkeypatch.setattr(contact, "MOST_ENTRIES", 1000 * points.count)
     again = solver.rollout(state, 4 * DT, 1)
     assert torch.isfinite(again.velocity).all()
 
@@ -188,7 +188,7 @@ def test_deterministic_contact_gives_the_same_bits():
     ends = []
     for _ in range(2):
         solver, state = scene(points, Contact(), boundaries, velocity=velocity, transfer="auto", deterministic=True)
-        assert solver.fused().recordable  # nothing waits for the host
+        assert solver.kernels.recordable  # nothing waits for the host
         for _ in range(3):  # without and with graphs
             state = solver.rollout(state, DT, 12)
         ends.append(state.position)

@@ -15,7 +15,7 @@ from gaussian_swaying import AeroForce, WindField, WindForce
 from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.geometry.regions import Everything
 from gaussian_swaying.kernels.launch import lanes
-from gaussian_swaying.mpm import total_run
+from gaussian_swaying.mpm import total
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.wind.field import FlowKey
 from gaussian_swaying.wind.patches import Patches
@@ -225,7 +225,7 @@ def test_an_obstacle_of_a_user_runs_in_torch(kernel_device):
             return distance - 0.01 * torch.sin(40 * place[..., 0]), normal
 
     def run(solver, state):
-        assert solver.transfer == "torch" or solver.fused().own_solids == []
+        assert solver.transfer == "torch" or solver.kernels.own_solids == []
         return solver.rollout(state, DT, 3)
 
     points = make_points(kernel_device, count=12)
@@ -298,9 +298,9 @@ def test_cells_of_any_size(kernel_device, case, programs, monkeypatch):
     formulation, sizes = case
     if programs > 1 and (formulation == "updated" or lanes(kernel_device, 64) < 64):
         pytest.skip("only `total` cuts cells, and only on a GPU")
-    monkeypatch.setattr(total_run, "_PROGRAMS", programs)
+    monkeypatch.setattr(total, "_PROGRAMS", programs)
     if len(sizes) > 2:
-        monkeypatch.setattr(total_run, "_lanes", lambda sizes: 64)
+        monkeypatch.setattr(total, "_lanes", lambda sizes: 64)
     generator = torch.Generator().manual_seed(7)
     cells = torch.repeat_interleave(torch.arange(len(sizes)), torch.tensor(sizes))
     place = 0.52 + 0.96 * torch.rand(len(cells), 3, generator=generator)  # of a cell, from the first node
@@ -314,7 +314,7 @@ def test_cells_of_any_size(kernel_device, case, programs, monkeypatch):
 def test_every_number_of_lanes(number, monkeypatch):
     """The others are used in other tests."""
     pytest.importorskip("triton")
-    monkeypatch.setattr(total_run, "_lanes", lambda sizes: number)
+    monkeypatch.setattr(total, "_lanes", lambda sizes: number)
     check_agreement(run_in_wind(make_points("cuda", count=300), "total"))
 
 
@@ -323,7 +323,7 @@ def test_a_node_adds_only_the_cells_around_it(monkeypatch):
     cell = torch.full((27, 2), 5)
     cell[[3, 20], 0] = torch.tensor([4, 2])
     cell[26, 1] = 0
-    assert total_run._sources(cell, 5).tolist() == [[3 * 6 + 4, 26 * 6], [20 * 6 + 2, 5]]
+    assert total._sources(cell, 5).tolist() == [[3 * 6 + 4, 26 * 6], [20 * 6 + 2, 5]]
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)

@@ -7,7 +7,7 @@ from catalogue import ELASTIC, PLASTIC
 from gaussian_swaying import Force, PinnedRegion, WindField
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm import run as substeps
-from gaussian_swaying.mpm import updated_run
+from gaussian_swaying.mpm import updated
 from gaussian_swaying.mpm.colliders import Plane
 from gaussian_swaying.mpm.device_functions import DeviceFunction, Numbers
 
@@ -119,7 +119,7 @@ def test_forces_in_torch_among_the_kernels(kernel_device, formulation, case, mon
     plane = Plane([0.0, 0.0, 0.13], [0.1, 0.0, 1.0], "separate")
     held = {"boundaries": [PinnedRegion(LEFT, start=1.5 * DT), plane]}
     monkeypatch.setattr(substeps, "MAX_STEPS", 3)
-    monkeypatch.setattr(updated_run, "sorted_for", lambda *known: 2)
+    monkeypatch.setattr(updated, "sorted_for", lambda *known: 2)
     law = ELASTIC["corotated"] if formulation == "total" else PLASTIC["sand that swells"]
     points = make_points(kernel_device, law, count=6, batch=(2,))
     pull = _Pull(kernel_device, resistance)
@@ -257,4 +257,4 @@ def test_forces_in_torch_are_replayed_from_graphs(formulation):
     assert called[0] > 22 - 1
     assert called[2] == called[3] == called[4] == once
     assert called[5] > 22 - 1
-    assert any(solvers[1].fused().repeater._graphs.values())
+    assert any(solvers[1].kernels.repeater._graphs.values())

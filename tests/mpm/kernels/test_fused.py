@@ -54,7 +54,7 @@ def test_buffers_end_with_their_solver(kernel_device, formulation):
     points = make_points(kernel_device, count=12)
     solver = make_solver("kernels", formulation, boundaries=[Plane([0, 0, 0.0], [0.0, 0, 1.0])])
     solver.rollout(set_going(solver, points), DT, 2)
-    buffer = weakref.ref(solver.fused().load)
+    buffer = weakref.ref(solver.kernels.load)
     gc.disable()
     try:
         del solver
@@ -127,7 +127,7 @@ def test_what_the_kernels_cannot_do(kernel_device, what):
         points, reason = points.map(torch.Tensor.double), "computes in float32, but the material is float64"
     solver = MPMSolver(dx=DX)
     state = solver.init_state(points)
-    assert solver.fused() is None
+    assert solver.kernels is None
     assert bool(torch.isfinite(solver.step(state, DT).position).all())
     assert reason in solver._obstacle
     with pytest.raises(ValueError, match=reason):
@@ -145,7 +145,7 @@ def test_who_computes_a_substep(kernel_device):
     ):
         solver = MPMSolver(dx=DX, formulation=formulation, **settings)
         solver.init_state(points)
-        assert (solver.fused() is not None) == has_kernels
+        assert (solver.kernels is not None) == has_kernels
         assert solver.deterministic == ("deterministic" in settings)
     solver = MPMSolver(dx=DX, formulation="updated", deterministic=True, transfer="kernels")
     with nullcontext() if ordered else pytest.raises(ValueError, match="sums have no fixed order"):
@@ -195,7 +195,7 @@ def test_courant_number(kernel_device, formulation, law):
         at = at if row == 0 else at.replace(velocity=torch.zeros_like(state.velocity))
         wide = at.replace(**{n: getattr(at, n).double() for n in ("F_elastic", "F_total", "velocity", "position")})
         found.append(float(exact.bound.cells_per_second(wide)))
-        assert float(solver.fused().largest_speed(at)) == pytest.approx(found[-1], rel=1e-5)
+        assert float(solver.kernels.largest_speed(at)) == pytest.approx(found[-1], rel=1e-5)
         assert float(solver.cfl_number(at, DT)) == pytest.approx(float(exact.cfl_number(wide, DT)), rel=1e-5)
     assert len(set(found)) >= (4 if law == "corotated" else 2)  # a network never stiffens by more than densities differ
 

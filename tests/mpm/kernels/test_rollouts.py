@@ -19,7 +19,7 @@ from gaussian_swaying import (
     WindField,
 )
 from gaussian_swaying._fixed import assign
-from gaussian_swaying.mpm import run, total_run, updated_run
+from gaussian_swaying.mpm import run, total, updated
 from gaussian_swaying.mpm.colliders import BallObstacle, EnclosingBox, Plane, VelocityBox
 from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.mpm.pins import Handle
@@ -68,7 +68,7 @@ def test_a_substep_that_changes(kernel_device, formulation):
 def test_rollouts_in_parts(kernel_device, formulation, monkeypatch):
     """Longer than the schedule and the sorting of the particles; the wind and the work continue."""
     monkeypatch.setattr(run, "MAX_STEPS", 4)
-    monkeypatch.setattr(updated_run, "sorted_for", lambda *known: 2)
+    monkeypatch.setattr(updated, "sorted_for", lambda *known: 2)
     wind = WindField(schedule=[FlowKey(0.0, [0.0] * 3), FlowKey(5 * DT, [30.0, 0.0, 0.0])], interpolation="linear")
     points = make_points(kernel_device, count=12, batch=(2,))
     load = make_load(points, [wind, WIND])
@@ -97,13 +97,13 @@ def test_looks_on_the_way(kernel_device, case, monkeypatch):
 
     With several energies, or with one that has no kernel, the checks run in torch, between the kernels' substeps.
     """
-    monkeypatch.setattr(updated_run, "sorted_for", lambda *known: 2)
+    monkeypatch.setattr(updated, "sorted_for", lambda *known: 2)
     laws, formulation = case[0].split(" and "), case[1]
     index = torch.arange(24) % 2 if len(laws) > 1 else None
     points = make_points(kernel_device, [(ELASTIC | PLASTIC)[law] for law in laws], law_index=index)
 
     def run(solver, state):
-        if solver.transfer == "kernels" and solver.fused().watches:
+        if solver.transfer == "kernels" and solver.kernels.watches:
             assert solver.bound.longest_substep > DT  # of the material at rest, in torch, once
             monkeypatch.setattr(solver.laws, "moduli", None)  # the measured values stay in the kernels
         return solver.watched_rollout(state, DT, 3, make_load(points), 3)
@@ -119,7 +119,7 @@ def test_atomic_sums(wide, monkeypatch):
     """An older GPU adds the numbers of a node one by one; more points share a cell than are summed up before."""
     if wide and torch.cuda.get_device_capability() < (9, 0):
         pytest.skip("this GPU has no such instruction")
-    monkeypatch.setattr(updated_run, "wide", lambda device: wide)
+    monkeypatch.setattr(updated, "wide", lambda device: wide)
     points = make_points(torch.device("cuda"), PLASTIC["sand"], count=100)
     check_agreement(run_both(points, lambda solver, state: solver.rollout(state, DT, 3), "updated"))
 
@@ -160,7 +160,7 @@ REPLAYED = {
 def test_replayed_rollouts_give_the_same_bits(kernel_device, case, monkeypatch):
     """On a GPU nothing is recorded at first; results stay as they are when another rollout follows."""
     steps = 37 if kernel_device.type == "cuda" else 5
-    monkeypatch.setattr(total_run, "_PROGRAMS", 1 if case == "nodes, crowded cells" else 2048)
+    monkeypatch.setattr(total, "_PROGRAMS", 1 if case == "nodes, crowded cells" else 2048)
     given = REPLAYED[case]
     points = make_points(kernel_device, count=given.get("count", 12), batch=given.get("batch", ()))
     solver = make_solver("kernels", "total", boundaries=given["boundaries"]())
@@ -256,7 +256,7 @@ def test_grids_that_grow_take_the_memory_of_the_largest():
             for _ in range(2):
                 state = solver.rollout(state, 1e-5, 7)
                 most = max(most, torch.cuda.memory_reserved())
-            assert sum(map(len, solver.fused().repeater._graphs.values())) == 2  # of four substeps and of one
+            assert sum(map(len, solver.kernels.repeater._graphs.values())) == 2  # of four substeps and of one
         assert not state.lost.any()
         return most
 
@@ -290,7 +290,7 @@ def test_a_cloud_that_flies_away_is_followed_in_bounded_memory(flight):
         state = solver.rollout(state, 1e-3, 20)
         most = max(most, torch.cuda.memory_reserved() - before)
         # three sizes, for both buffers between which a sort moves the particles
-        assert sum(map(len, solver.fused().repeater._graphs.values())) <= 6
+        assert sum(map(len, solver.kernels.repeater._graphs.values())) <= 6
     assert not state.lost.any()
     assert 1 < len(set(grids)) < 40
     # some fifty numbers of four bytes a node in buffers and temporaries, three times over, and PyTorch's blocks
@@ -377,7 +377,7 @@ def _end(case, dtype):
         state = solver.fit_grid(state, 40 * DT / 4)
     for _ in range(2):
         state = solver.rollout(state, DT / 4, 20, load)
-    assert solver.fused() is not None
+    assert solver.kernels is not None
     return state
 
 
