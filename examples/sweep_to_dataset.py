@@ -8,7 +8,7 @@ from torch.utils.data import DataLoader
 from gaussian_swaying.cli.shipped import folder as folder_of_shipped
 from gaussian_swaying.sweeps.dataset import SweepDataset
 from gaussian_swaying.sweeps.plan import make_plan, read_sweep
-from gaussian_swaying.sweeps.sweep import run_sweep
+from gaussian_swaying.sweeps.run import run_sweep
 
 
 def main(

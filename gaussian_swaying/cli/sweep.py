@@ -116,10 +116,10 @@ def explain(error: BaseException) -> str:
 
 def sweep(options: argparse.Namespace, begun: list[Path], arguments: Sequence[str]) -> int:
     """Do the runs that are missing, and report; the folder is put into ``begun`` once it is the sweep's."""
+    from gaussian_swaying.sweeps.dataset import SHARDS, write_shards
     from gaussian_swaying.sweeps.plan import make_plan, read_sweep
     from gaussian_swaying.sweeps.record import PARQUET, TABLE
-    from gaussian_swaying.sweeps.shards import SHARDS, write_shards
-    from gaussian_swaying.sweeps.sweep import run_sweep
+    from gaussian_swaying.sweeps.run import run_sweep
 
     if options.shards is not None and (options.shards < 1 or options.part is not None):
         raise ValueError("Expected `--shards` to be at least 1, and without `--part`: write them when all is done.")

@@ -411,17 +411,11 @@ def with_gradients(points: MaterialPoints, material: Material) -> MaterialPoints
 
 
 _SAMPLE = 100_000  # Gaussians that are sorted, at most
-
 _FEW = 16  # fewer Gaussians are not checked
-
 FAR, TOO_FAR = 20, 1000  # multiples of the side of the box around 98 % of the Gaussians
-
 COARSE, SHORT, TOO_SHORT = 10.0, 3.0, 0.5  # cells along the longest side
-
 NARROW, ROUND, BENT = (0.25, 4.0), 0.5, 0.2  # cells across a tube; least side over middle side; motion over length
-
 SPARSE = 0.75  # cells between neighbouring Gaussians
-
 _SPACED = 4096  # Gaussians whose nearest neighbour is searched
 
 
@@ -659,7 +653,6 @@ def attached_points(pairs: Tensor, owner: Tensor, parent: Tensor | None, layers:
 
 
 REACH, LEAST = 1.0, 3  # points so near to a joint hold it [cells], and at least so many of each part
-
 NEXT = 1.5  # a joint is in the middle between pairs of Gaussians at most so many times as far apart as the nearest
 
 
@@ -747,14 +740,11 @@ def with_parts(scene: Scene, cloud: GaussianCloud, material: Material, solver: S
 
 
 _FLAT = 0.01  # standard deviation [cubes] below which a group has no extent in a direction
-
 SHARED = 4
 """Largest number of directions in a group whose patches are shared among all its points."""
 
 SIMPSON = (2 / 3, 1 / 6, 1 / 6)  # middle plane and faces of a sheet: exact for the square of the height
-
 _PROPERTIES = ("E", "nu", "density", "thickness", "bending", "damping_ratio")
-
 _KINDS = ("E", "nu", "density", "thickness", "bending", "damping")
 
 

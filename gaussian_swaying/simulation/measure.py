@@ -24,7 +24,6 @@ from gaussian_swaying.mpm.state import State, support_force
 from gaussian_swaying.wind.force import AirLift
 
 _PARTICLES = ("moved_particle", "compressed_particle", "stretched_particle")
-
 _SAMPLE = 4096  # particles whose nearest neighbour is searched
 
 
@@ -231,7 +230,6 @@ class Measurement:
 _OF_SCENE = tuple(
     name for name in FrameDiagnostics.__dataclass_fields__ if name not in ("time", "substeps", "cfl", "support")
 )
-
 _EXTREMES: dict[str, Callable[..., Any]] = {"J_min": min, "J_max": max, "stretch_min": min, "stretch_max": max}
 
 _EXTREMES |= {"displacement_max": max, "displacement_mean": lambda values: sum(values) / len(values)}
@@ -392,7 +390,6 @@ def _outran(before: State, after: State) -> Tensor:
 
 
 FARTHEST = 1000  # a run ends when a particle is so many sizes of the object away from where it started
-
 _FAR, _LOST, _NOT_FINITE = 1, 2, 3  # what is wrong with a particle; the last is the worst
 
 
@@ -434,7 +431,6 @@ def _raise_if_bad(solver: Solver, verdict: list[float], time: float) -> None:
 
 
 SOUND = (0.5, 2.0)  # range of stretch within which the object keeps its intended shape
-
 USUAL = 0.2  # largest displacement, as a fraction of the size, that still looks like wind
 
 
@@ -520,9 +516,7 @@ def _digits(value: float) -> str:
 
 
 LONG_FRAME = 60.0  # s; a first frame that takes longer is reported
-
 MANY_TIMES = 20  # a frame with this many times the substeps of the first is reported
-
 PAUSE = 1.0  # s between two updates within a frame
 
 

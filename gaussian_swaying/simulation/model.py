@@ -689,7 +689,6 @@ else:  # what a YAML file can contain: the annotations of the constructor are it
     SolverLike, MaterialLike = MPMSolver, Material
 
 HoldLike = Region | PinnedRegion | PinnedPoints | list[Region | PinnedRegion | PinnedPoints]
-
 CELLS = 32
 """Largest number of grid cells along the longest side if no solver is given."""
 
@@ -832,5 +831,4 @@ _KINDS: dict[str, tuple[type, ...]] = {
     "normalisation": (Normalisation,),
     "hold": (Region, PinnedRegion, PinnedPoints, list, tuple),
 }
-
 _LISTS = {"forces": (Force,), "edits": (Edit,), "copies": (Copy,), "hold": (Region, PinnedRegion, PinnedPoints)}

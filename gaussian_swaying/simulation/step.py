@@ -168,17 +168,11 @@ def _foot(scene: SimulatedScene, boundaries: Iterable[nn.Module]) -> Tensor:
 
 
 CFL_SAMPLES = 8  # checks per frame, as material may stiffen and soften again within it
-
 MAX_WIND = 1e6  # m/s; anything above is a mistake and would overflow positions
-
 MAX_GROWTH = 1000  # a frame that takes this many times the substeps of the first ends the run
-
 MAX_SUBSTEPS = 1_000_000  # per frame: hours on a CPU, and minutes on the fastest GPU
-
 MAX_RETRIES = 4  # of a frame
-
 CFL_LIMIT = 0.5  # an adaptive frame that exceeds it is repeated with shorter substeps
-
 ROUNDING_SHARE = 0.5
 """Share of the driving speed that the bound of :func:`rounding_speed` may reach in a second; rounding itself reaches a
 tenth of its bound or so."""

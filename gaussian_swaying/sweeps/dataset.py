@@ -1,18 +1,24 @@
-"""A sweep as a data set of torch: pictures, motion, parameters and figures of every complete run."""
+"""A sweep as a data set of torch, as WebDataset shards, and as a picture of all runs."""
 
 from __future__ import annotations
 
+import io
+import json
+import math
 import os
+import tarfile
 from collections.abc import Mapping
 from numbers import Real
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from gaussian_swaying._checks import check_positive
+from gaussian_swaying._files import atomic
 from gaussian_swaying.recording.nodes import load_nodes
 from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.sweeps.record import RUNS, SUMMARY, read_record, read_result
@@ -116,3 +122,160 @@ def _read_frames(place: Path) -> Tensor:
 def _check_recorded(path: Path, wanted: str, setting: str) -> None:
     if not path.exists():
         raise ValueError(f"{path} does not exist: leave out `{wanted}`, or sweep with {setting}.")
+
+
+SHARDS = "shards"
+
+
+def write_shards(
+    folder: str | os.PathLike[str],
+    runs_per_shard: int = 100,
+    output: str | os.PathLike[str] | None = None,
+    frames: bool = True,
+    positions: bool = False,
+    nodes: bool = False,
+) -> list[Path]:
+    """Write the complete runs of a sweep as tar files ``000000.tar`` and so on, which WebDataset reads.
+
+    A sample has ``json`` (run, settings, summary), ``parameters.npy``, and what is wanted of ``00000.png`` and so on
+    (its pictures), ``positions.npy`` and ``nodes.npy``, as in :class:`~gaussian_swaying.sweeps.dataset.SweepDataset`.
+    The same runs give the same bytes.
+
+    Args:
+        folder: Folder of the sweep.
+        runs_per_shard: Runs in a file.
+        output: Folder of the files; ``shards`` in the folder of the sweep if None.
+        frames: Whether to put in the pictures.
+        positions: Whether to put in the trajectories.
+        nodes: Whether to put in the displacements of nodes.
+
+    Returns:
+        The files.
+    """
+    check_positive("runs_per_shard", runs_per_shard)
+    data = SweepDataset(folder, frames=False, positions=positions, nodes=nodes)
+    target = Path(folder) / SHARDS if output is None else Path(output)
+    target.mkdir(parents=True, exist_ok=True)
+    made = []
+    for first in range(0, len(data), runs_per_shard):
+        made.append(target / f"{first // runs_per_shard:06d}.tar")
+        with atomic(made[-1]) as temporary, tarfile.open(temporary, "w", format=tarfile.USTAR_FORMAT) as tar:
+            for index in range(first, min(first + runs_per_shard, len(data))):
+                _add_run(tar, data, index, frames)
+    for file in target.glob("[0-9]" * 6 + ".tar"):  # of a sweep with fewer complete runs or smaller shards
+        if file not in made:
+            file.unlink()
+    return made
+
+
+def _add_run(tar: tarfile.TarFile, data: SweepDataset, index: int, frames: bool) -> None:
+    item, run = data[index], data.runs[index]
+    summary = dict(zip(data.summary_names, item["summary"].tolist(), strict=True))
+    told = {"run": run, "settings": data.settings[index], "parameter_names": data.parameter_names}
+    told["summary"] = {name: None if value != value else value for name, value in summary.items()}  # NaN is not JSON
+    _add(tar, f"{run}.json", json.dumps(told).encode())
+    for name in ("parameters", "positions", "nodes"):
+        if name in item:
+            _add(tar, f"{run}.{name}.npy", _npy(item[name].numpy()))
+    pictures = sorted((data.folder / RUNS / run / "frames").glob("[0-9]*.png")) if frames else []
+    if frames and not pictures:
+        raise ValueError(f"Run {run} has no pictures: leave out `frames`, or sweep with recorder.images: true.")
+    for picture in pictures:
+        _add(tar, f"{run}.{picture.name}", picture.read_bytes())
+
+
+def _npy(values: np.ndarray[Any, Any]) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, values)
+    return buffer.getvalue()
+
+
+def _add(tar: tarfile.TarFile, name: str, content: bytes) -> None:
+    entry = tarfile.TarInfo(name)
+    entry.size = len(content)
+    tar.addfile(entry, io.BytesIO(content))
+
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+PICTURES = ("last", "middle")
+PER_SHEET = 200  # runs
+WIDTH, BAND, GAP = 240, 34, 4  # pixels of a picture, of the text below it, and between two
+BACKGROUND, EMPTY, TEXT = (24, 24, 24), (48, 48, 48), (235, 235, 235)
+
+
+def write_contact_sheets(folder: Path, picture: str = "last") -> list[Path]:
+    """Write ``contact_sheet.png`` of a sweep, and ``contact_sheet_2.png`` ... if there are more than 200 runs.
+
+    Args:
+        folder: Folder of the sweep.
+        picture: Frame to show, ``last`` or ``middle``.
+
+    Returns:
+        The files.
+    """
+    runs = read_record(folder)["runs"]
+    files = []
+    for first in range(0, len(runs), PER_SHEET):
+        part = {f"{first + number:05d}": run for number, run in enumerate(runs[first : first + PER_SHEET])}
+        files.append(folder / ("contact_sheet.png" if first == 0 else f"contact_sheet_{first // PER_SHEET + 1}.png"))
+        sheet = _sheet(folder, part, picture)
+        with atomic(files[-1]) as temporary:
+            sheet.save(temporary)
+    return files
+
+
+def _sheet(folder: Path, runs: Mapping[str, Mapping[str, Any]], picture: str) -> Image:
+    from PIL import Image, ImageDraw, ImageFont
+
+    shown = {name: _frame(folder, name, picture) for name in runs}
+    sizes = [image.size for image in shown.values() if image is not None]
+    height = max((height for _, height in sizes), default=WIDTH * 9 // 16)
+    across = max(1, min(len(runs), round(math.sqrt(len(runs) * height / WIDTH * 1.6))))
+    down = math.ceil(len(runs) / across)
+    sheet = Image.new("RGB", (across * (WIDTH + GAP) + GAP, down * (height + BAND + GAP) + GAP), BACKGROUND)
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(12)
+    for number, (name, run) in enumerate(runs.items()):
+        left, top = GAP + number % across * (WIDTH + GAP), GAP + number // across * (height + BAND + GAP)
+        image = shown[name]
+        if image is None:
+            result = read_result(folder, name) or {"status": "missing"}
+            draw.rectangle((left, top, left + WIDTH - 1, top + height - 1), fill=EMPTY)
+            what = "no picture" if result["status"] == "complete" else result["status"]
+            draw.text((left + WIDTH / 2, top + height / 2), what, TEXT, font, anchor="mm")
+        else:
+            sheet.paste(image, (left, top))
+        lines = [name, ", ".join(f"{axis.rpartition('.')[2]} {_short(value)}" for axis, value in run.items())]
+        for line, text in enumerate(lines):
+            draw.text((left + 3, top + height + 2 + 15 * line), _fitted(text, draw, font), TEXT, font)
+    return sheet
+
+
+def _frame(folder: Path, name: str, picture: str) -> Image | None:
+    """A frame of a run that has ended, small; None if there is none."""
+    from PIL import Image
+
+    result = read_result(folder, name)
+    if result is None or result["status"] != "complete":
+        return None
+    files = sorted((folder / RUNS / name / "frames").glob("[0-9]*.png"))
+    if not files:
+        return None
+    with Image.open(files[-1] if picture == "last" else files[len(files) // 2]) as image:
+        height = max(1, round(image.height * WIDTH / image.width))
+        return image.convert("RGB").resize((WIDTH, height), Image.Resampling.BOX if image.width > WIDTH else 0)
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, list):
+        return "[" + ", ".join(_short(item) for item in value) + "]"
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _fitted(text: str, draw: Any, font: Any) -> str:
+    while text and draw.textlength(text, font) > WIDTH - 6:
+        text = text[:-2].rstrip("…") + "…" if len(text) > 2 else ""
+    return text

@@ -24,7 +24,6 @@ SWEEP, TABLE, TIMES = "sweep.json", "sweep.csv", "times.csv"
 PARQUET = "sweep.parquet"
 RUNS, RESULTS, LOGS, SHARES = "runs", "results", "logs", "parts"
 OURS = (SWEEP, TABLE, TIMES, PARQUET, RUNS, RESULTS, LOGS)
-
 FIGURES = (
     "frames",
     "substeps",
@@ -42,6 +41,7 @@ FIGURES = (
     "torn_particles",
 )
 """Entries of ``summary.json`` in the table; none of them is a time of the clock."""
+
 ENERGIES = ("kinetic", "elastic", "potential")
 PARTS = ("startup", "simulation", "shading", "rendering", "writing")
 SUMMARY = (*FIGURES, *(f"{name}_end_J" for name in ENERGIES), "warnings")
@@ -147,8 +147,6 @@ def _check_same(folder: Path, new: dict[str, Any]) -> None:
 
 
 # ---- results
-
-
 def result_file(folder: Path, name: str) -> Path:
     """The result of a run."""
     return folder / RESULTS / f"{name}.json"
@@ -204,8 +202,6 @@ def failure(status: str, reason: str, attempt: int) -> dict[str, Any]:
 
 
 # ---- tables
-
-
 def write_tables(
     folder: Path, names: Sequence[str], runs: Sequence[Mapping[str, Any]], results: Mapping[str, Any]
 ) -> None:

@@ -20,7 +20,7 @@ from gaussian_swaying.simulation.body import Material, Scene
 from gaussian_swaying.simulation.model import Edit, in_settings, names, number, of_settings
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep
-from gaussian_swaying.sweeps.together import grouped
+from gaussian_swaying.sweeps.run import grouped
 from gaussian_swaying.viewer.changes import changed_settings
 from gaussian_swaying.viewer.session import Session
 

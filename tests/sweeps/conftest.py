@@ -9,7 +9,7 @@ import yaml
 from shared import SMALL
 
 from gaussian_swaying.cli.sweep import main
-from gaussian_swaying.sweeps import pool
+from gaussian_swaying.sweeps import run
 
 FLAG = Path(__file__).parents[2] / "configs/sim/flag.yaml"
 AXES = {
@@ -49,7 +49,7 @@ def _workers():
         ["gaussian_swaying.cli.sweep", "gaussian_swaying.simulation.simulation", "torch._dynamo"]
     )
     with pytest.MonkeyPatch.context() as changes:
-        changes.setattr(pool, "get_context", lambda method: server)
+        changes.setattr(run, "get_context", lambda method: server)
         yield
 
 
@@ -63,7 +63,7 @@ def kill(monkeypatch):
     """Lets so many jobs be the last of their workers, which are killed when they have got them."""
 
     def begin(jobs):
-        submit, left = pool.Pool.submit, list(range(jobs))
+        submit, left = run.Pool.submit, list(range(jobs))
 
         def submitting(self, job):
             submit(self, job)
@@ -71,7 +71,7 @@ def kill(monkeypatch):
                 left.pop()
                 next(worker for worker in self._workers if worker.job is job).process.kill()
 
-        monkeypatch.setattr(pool.Pool, "submit", submitting)
+        monkeypatch.setattr(run.Pool, "submit", submitting)
 
     return begin
 

@@ -3,7 +3,7 @@
 import pytest
 
 from gaussian_swaying.config.parser import option
-from gaussian_swaying.sweeps.axes import read_axis, runs_of
+from gaussian_swaying.sweeps.plan import read_axis, runs_of
 
 
 def _runs(axes, **more):

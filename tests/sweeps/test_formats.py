@@ -10,9 +10,8 @@ from PIL import Image
 
 from gaussian_swaying.cli.sweep import main
 from gaussian_swaying.sweeps import record
-from gaussian_swaying.sweeps.dataset import SweepDataset
+from gaussian_swaying.sweeps.dataset import SweepDataset, write_shards
 from gaussian_swaying.sweeps.record import write_parquet
-from gaussian_swaying.sweeps.shards import write_shards
 
 from .conftest import rows
 

@@ -11,9 +11,8 @@ from shared import advanced
 
 from gaussian_swaying.cli.sweep import main
 from gaussian_swaying.simulation.simulation import Simulation, batch_of
-from gaussian_swaying.sweeps.backend import Job
 from gaussian_swaying.sweeps.plan import make_plan, read_sweep
-from gaussian_swaying.sweeps.together import members_of
+from gaussian_swaying.sweeps.run import Job, members_of
 
 from .conftest import rows
 

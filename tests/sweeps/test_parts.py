@@ -6,8 +6,7 @@ from concurrent.futures import ProcessPoolExecutor
 import pytest
 
 from gaussian_swaying.cli.sweep import main
-from gaussian_swaying.sweeps.backend import Job, Outcome, drive
-from gaussian_swaying.sweeps.pool import Pool
+from gaussian_swaying.sweeps.run import Job, Outcome, Pool, drive
 
 
 @pytest.mark.slow

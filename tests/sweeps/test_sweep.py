@@ -14,10 +14,9 @@ from shared import refused
 from gaussian_swaying.cli.sweep import explain, main
 from gaussian_swaying.runs.lock import LOCK, FolderLock
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.sweeps import pool, sweep, worker
-from gaussian_swaying.sweeps.backend import Job
+from gaussian_swaying.sweeps import run
 from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep
-from gaussian_swaying.sweeps.worker import do
+from gaussian_swaying.sweeps.run import Job, do
 
 from .conftest import rows
 
@@ -110,14 +109,14 @@ def test_a_run_goes_on_where_its_worker_was_killed(undisturbed, tmp_path, sweep_
 
 @pytest.mark.usefixtures("default_signals")
 def test_a_stopped_sweep_ends_in_order(undisturbed, tmp_path, sweep_file, monkeypatch, capsys):
-    file, folder, ended = sweep_file(tmp_path / "tiny.yaml"), tmp_path / "out", sweep._Keeper.ended
+    file, folder, ended = sweep_file(tmp_path / "tiny.yaml"), tmp_path / "out", run._Keeper.ended
 
     def stop(self, name, result):
         ended(self, name, result)
         os.kill(os.getpid(), signal.SIGTERM)
 
     with monkeypatch.context() as patch:
-        patch.setattr(sweep._Keeper, "ended", stop)
+        patch.setattr(run._Keeper, "ended", stop)
         assert main([str(file), "--output", str(folder), *QUICK]) == 143
     error = capsys.readouterr().err
     assert "Stopped; complete runs are kept" in error
@@ -135,15 +134,15 @@ def test_a_stopped_sweep_ends_in_order(undisturbed, tmp_path, sweep_file, monkey
 
 def test_ctrl_c_of_the_terminal_is_for_the_driver_alone(tmp_path, sweep_file, monkeypatch):
     """Workers do not hear it, not even while they import."""
-    hire = pool.Pool._hire
+    hire = run.Pool._hire
 
     def disturbed(self):
         found = hire(self)
         os.kill(found.process.pid, signal.SIGINT)
         return found
 
-    monkeypatch.setattr(pool, "get_context", multiprocessing.get_context)  # by spawn, as outside the tests
-    monkeypatch.setattr(pool.Pool, "_hire", disturbed)
+    monkeypatch.setattr(run, "get_context", multiprocessing.get_context)  # by spawn, as outside the tests
+    monkeypatch.setattr(run.Pool, "_hire", disturbed)
     file = sweep_file(tmp_path / "one.yaml", {"wind.seed": [1]}, 1, {"frames": 2})
     assert main([str(file), "--output", str(tmp_path / "out"), *QUICK]) == 0
     assert [row["attempts"] for row in rows(tmp_path / "out/times.csv")] == ["1"]
@@ -186,7 +185,7 @@ def test_what_failed_is_told_in_one_sentence(tmp_path, monkeypatch, error, words
     def fail(job, parser):
         raise error
 
-    monkeypatch.setattr(worker, "_run", fail)
+    monkeypatch.setattr(run, "_run", fail)
     (tmp_path / "logs").mkdir()
     done = do(Job(tmp_path, ("00000",), "", 2, ({},), attempt=2), None, explain)
     result = done.results["00000"]

@@ -10,9 +10,8 @@ from gaussian_swaying.cli.sweep import main
 from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.simulation.model import in_settings
 from gaussian_swaying.simulation.simulation import Simulation, batch_of
-from gaussian_swaying.sweeps.backend import Job
 from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep
-from gaussian_swaying.sweeps.together import grouped, members_of, texts
+from gaussian_swaying.sweeps.run import Job, grouped, members_of, texts
 
 from .conftest import rows
 
@@ -94,7 +93,7 @@ def test_the_configurations_of_a_group_are_those_that_the_parser_writes(tmp_path
         calls.append(given)
         return config_text(*given) + more
 
-    monkeypatch.setattr("gaussian_swaying.sweeps.together.config_text", counted)
+    monkeypatch.setattr("gaussian_swaying.sweeps.run.config_text", counted)
     more = ""
     assert texts(parser, settings, list(axes)) == expected
     assert len(calls) == 1
