@@ -11,10 +11,10 @@ import torch
 
 from gaussian_swaying import AeroForce, Material, MPMSolver, OrbitCamera, Simulation
 from gaussian_swaying.gaussians.parts import Part, Parts
-from gaussian_swaying.preview.parts import greenish
 from gaussian_swaying.scenes.ficus import FicusScene
 from gaussian_swaying.scenes.procedural import GivenScene
 from gaussian_swaying.simulation.body import Scene
+from gaussian_swaying.suggestion.measures import Gaussians
 
 
 def main(folder: Path, frames: int = 50, spacing: float = 0.03, dx: float = 0.08) -> dict[str, float]:
@@ -30,7 +30,7 @@ def main(folder: Path, frames: int = 50, spacing: float = 0.03, dx: float = 0.08
 
     folder.mkdir(parents=True, exist_ok=True)
     cloud = FicusScene(spacing=spacing, leaves=600).generate()
-    height, green = cloud.means[:, 2], greenish(cloud.sh)
+    height, green = cloud.means[:, 2], torch.from_numpy(Gaussians.of(cloud).green)
     label = torch.where(green, 3, 2)  # leaves and wood
     label[(height < 0.32) & ~green] = 1  # the pot and its soil
     label[height < 0.02] = 0  # the floor

@@ -38,6 +38,7 @@ from .simulation.model import Copy as Copy
 from .simulation.model import Edit as Edit
 from .simulation.model import Live as Live
 from .simulation.simulation import Simulation as Simulation
+from .suggestion.suggest import suggest as suggest
 from .training.data.datamodule import CaptureDataModule as CaptureDataModule
 from .training.module import SplatTrainer as SplatTrainer
 from .wind.field import GaussianGust as GaussianGust

@@ -7,7 +7,6 @@ import pytest
 import torch
 from shared import unit
 
-from gaussian_swaying.cli.preview import build_options, preview_scene
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.gaussians.ply import write_ply
@@ -15,13 +14,12 @@ from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.preview.cost import Cost
-from gaussian_swaying.preview.results import write
-from gaussian_swaying.preview.starter import starter_yaml
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
 from gaussian_swaying.simulation.body import Material, Scene, SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.suggestion.cost import Cost
+from gaussian_swaying.suggestion.suggest import suggest
 from gaussian_swaying.wind.field import WindField
 
 
@@ -108,27 +106,21 @@ def lamp(count=3000):
 
 def run_cost(dx, **numbers):
     """A cost of a run on a grid, of which some numbers matter."""
-    ones = dict.fromkeys(("wave_speed", "stable_substep", "substep", "substep_seconds", "simulation_seconds"), 1.0)
     found = {"device": "", "particles": 1, "grid": (1, 1, 1), "frames": 51, "substeps": 1, "picture_seconds": None}
-    return Cost(dx=dx, **(found | ones | numbers))
+    return Cost(dx=dx, **(found | dict.fromkeys(("substep_seconds", "simulation_seconds"), 1.0) | numbers))
 
 
-def started(found, cloud, folder):
-    """The simulation of the starter of a suggestion."""
+def started(found, cloud, folder, frames=2):
+    """The simulation of the configuration of a suggestion."""
     write_ply(folder / "it.ply", cloud)
-    if found.parts is not None:
-        path = found.parts.parts.save(folder / "parts.npz")
-        found = dataclasses.replace(found, parts=dataclasses.replace(found.parts, path=str(path)))
-    (folder / "starter.yaml").write_text(starter_yaml(found, folder / "it.ply", 2))
+    found.to_yaml(folder / "starter.yaml", frames, folder / "it.ply")
     return Simulation.from_yaml(folder / "starter.yaml", device="cpu")
 
 
-def previewed(cloud, folder, *options, up="--up=+z"):
-    write_ply(folder / "it.ply", cloud)
-    given = [str(folder / "it.ply"), up, "--device", "cpu", "--quality", "draft", "--height", "96", *options]
-    preview = preview_scene(build_options().parse_args(list(filter(None, given))), folder)
-    write(preview, folder)
-    return preview, Simulation.from_yaml(folder / "starter.yaml", device="cpu")
+def previewed(cloud, folder, **options):
+    """The suggestion for a splat with z up, and the simulation of its configuration."""
+    found = suggest(cloud, **{"up": "+z", "device": "cpu", "quality": "draft", **options})
+    return found, started(found, cloud, folder, 250)
 
 
 def varied_cloud(count=300, degree=1, seed=0, normals=False):

@@ -131,16 +131,12 @@ def first_cameras(
 ) -> list[Camera]:
     """Cameras around a splat, from which it fills the picture."""
     from gaussian_swaying.fitting.registration import cameras_around
-    from gaussian_swaying.geometry.patches import smallest_axis_normal
-    from gaussian_swaying.preview.suggest import visible_weight
-    from gaussian_swaying.preview.up import guess_up
+    from gaussian_swaying.suggestion.measures import Gaussians
+    from gaussian_swaying.suggestion.up import guess_up
 
-    weight = visible_weight(cloud)
-    if up is None:
-        up = guess_up(cloud.means, smallest_axis_normal(cloud.quats, cloud.scales), weight).direction
-    chosen = cloud.means[
-        torch.multinomial(weight, 10_000, replacement=True, generator=torch.Generator().manual_seed(0))
-    ]
+    splat, draw = Gaussians.of(cloud), torch.Generator().manual_seed(0)
+    up = guess_up(splat)[0].direction if up is None else up
+    chosen = cloud.means[torch.multinomial(torch.from_numpy(splat.weight), 10_000, replacement=True, generator=draw)]
     low, high = (torch.quantile(chosen, share, dim=0) for share in (0.02, 0.98))
     narrow = math.tan(math.radians(fov) / 2) * min(1.0, width / height)
     distance = ROOM * 0.5 * float((high - low).norm()) / narrow

@@ -11,23 +11,23 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 from torch import Tensor
 
 from gaussian_swaying import _program as program
 from gaussian_swaying._files import write_json, write_text
 from gaussian_swaying.cli.camera import CAMERAS, PICTURE, STILLS, VIEW, first_cameras, fov_of, painter_of, transforms
-from gaussian_swaying.cli.preview import build_options, preview_scene, up_of
+from gaussian_swaying.cli.preview import keep_aside, up_of, write_starter
 from gaussian_swaying.fitting.film import Film, begins_to_move, first_frame, open_film, pixels_of_focal
 from gaussian_swaying.fitting.held import held_end, moving_box, moving_points
 from gaussian_swaying.fitting.scale import SCALE
 from gaussian_swaying.fitting.videos import Footage, read_videos
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.preview.hold import given_hold
-from gaussian_swaying.preview.results import Preview, keep_aside, write
-from gaussian_swaying.preview.shape import DIRECTIONS
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.protocol import RenderOutput
+from gaussian_swaying.suggestion.hold import given_hold
+from gaussian_swaying.suggestion.measures import DIRECTIONS
+from gaussian_swaying.suggestion.suggest import suggest
+from gaussian_swaying.suggestion.suggestion import Suggestion
 
 PLAN, LOOK, RESULT = "fit.yaml", "preview", "result"
 SECONDS = 1.5
@@ -70,6 +70,8 @@ def prepare(options: argparse.Namespace, folder: Path) -> Path:
     Returns:
         The fit file.
     """
+    import imageio.v3 as iio
+
     length, weighed = _length(options.length), options.length == [GRAVITY]
     if options.focal is not None and not 5 <= options.focal <= 1000:
         raise ValueError(f"Expected `--focal` from 5 to 1000 mm, but got {options.focal:g}.")
@@ -99,20 +101,21 @@ def prepare(options: argparse.Namespace, folder: Path) -> Path:
     data = transforms(seen.camera, where, seen.cloud.origin)
     data["frames"][0] |= {"begin": round(begin, 4), "seconds": round(seconds, 4)}
     write_json(folder / CAMERAS, data)
-    look, wanted = folder / LOOK, {"up": options.up, "hold": options.hold}
-    preview = _previewed(options, look, wanted)
+    look, wanted = folder / LOOK, {"up": options.up and _direction(options.up), "hold": options.hold}
+    preview = _previewed(options, wanted)
     shown, told = _shown(seen, read_videos(folder / CAMERAS, origin=seen.cloud.origin)[0], preview, wanted)
     if shown:
-        preview = _previewed(options, look, wanted | shown)
+        preview = _previewed(options, wanted | shown)
     if length is not None:
         longest = longest_side(*length, seen, preview)
-        preview = _previewed(options, look, wanted | shown | {"longest_side": longest})
-    if weighed and not any(yaml.safe_load(preview.starter)["solver"]["gravity"]):
+        preview = _previewed(options, wanted | shown | {"longest_side": longest})
+    if weighed and not preview.falls:
         raise ValueError(
             "`--length gravity` is for a sheet alone, or for what nothing holds: anything else was captured in balance "
             "with its weight. Give a length that you know."
         )
-    write(preview, look)
+    write_starter(preview, look, 250)
+    iio.imwrite(look / "preview.png", preview.picture())
     scaled = GRAVITY if weighed else "" if length is None else "length"
     text = plan_text(preview, _background(seen), None if at_once else moves - begin, scaled, folder)
     keep_aside(folder / PLAN, text)
@@ -189,15 +192,15 @@ def _background(seen: Seen) -> list[float]:
     return [round(value / 255, 3) for value in pixels.median(0).values.tolist()]
 
 
-def _shown(seen: Seen, video: Footage, preview: Preview, wanted: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+def _shown(seen: Seen, video: Footage, preview: Suggestion, wanted: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """Options of the preview that the film knows better than the splat, and sentences on them."""
     shown: dict[str, Any] = {}
-    guess, told = preview.data["suggestion"]["up"], []
-    up = guess["direction"]
-    if wanted["up"] is None and guess["confidence"] in ("low", "medium"):
+    told: list[str] = []
+    up = preview.up.direction
+    if wanted["up"] is None and preview.up.confidence in ("low", "medium"):
         upright = upright_in(seen.camera, up)
         if upright is not None:
-            shown["up"], up = upright, _direction(upright)
+            up = shown["up"] = tuple(_direction(upright))
             told.append(f"up: {' '.join(upright)}, as the film is upright")
     if preview.parts is not None and not shown:
         return {}, []
@@ -205,8 +208,8 @@ def _shown(seen: Seen, video: Footage, preview: Preview, wanted: dict[str, Any])
     box = moving_box(places, moved, seen.cloud)
     if box is not None:
         low, high = box
-        shown["region"] = [round(value, 4) for value in (*low.tolist(), *high.tolist())]
-        told.append(f"what moves in the film: from {shown['region'][:3]} to {shown['region'][3:]}")
+        shown["region"] = [[round(value, 4) for value in corner.tolist()] for corner in box]
+        told.append("what moves in the film: from {} to {}".format(*shown["region"]))
         inside = ((places >= low) & (places <= high)).all(-1)
         places, moved = places[inside], moved[inside]
     held = None if wanted["hold"] is not None else held_end(places, moved, up)
@@ -234,13 +237,11 @@ def upright_in(camera: Camera, guess: Sequence[float]) -> list[str] | None:
     return [best] if along[best] > NEARLY else [f"{part:.4f}" for part in up.tolist()]
 
 
-def _previewed(options: argparse.Namespace, folder: Path, wanted: dict[str, Any]) -> Preview:
-    given = build_options().parse_args([str(options.splat), f"--device={options.device}", "--quality=draft"])
-    vars(given).update(wanted)
-    return preview_scene(given, folder)
+def _previewed(options: argparse.Namespace, wanted: dict[str, Any]) -> Suggestion:
+    return suggest(options.splat, device=options.device, quality="draft", **wanted)
 
 
-def longest_side(name: str, metres: float, seen: Seen, preview: Preview) -> float:
+def longest_side(name: str, metres: float, seen: Seen, preview: Suggestion) -> float:
     """The length of the longest side [m] with which a named length has so many metres.
 
     Args:
@@ -251,19 +252,16 @@ def longest_side(name: str, metres: float, seen: Seen, preview: Preview) -> floa
     """
     if name == OBJECT:
         return metres
-    metres_per_unit = preview.data["suggestion"]["metres_per_unit"]
     if ":" in name:
-        return metres / (float((_place(name, 0, seen) - _place(name, 1, seen)).norm()) * metres_per_unit)
+        return metres / (float((_place(name, 0, seen) - _place(name, 1, seen)).norm()) * preview.metres_per_unit)
     parts = preview.parts
-    names = [] if parts is None else [part.name for part in parts.parts]
+    names = [] if parts is None else parts.names
     if parts is None or name not in names:
         raise ValueError(
             f"The splat has no part {name!r}: `--length` may name {', '.join([*names, OBJECT])}, or two places in the "
             "first frame, such as 120,80:120,640 (pixels from its left and upper edges)."
         )
-    return metres / (
-        extent(seen.cloud.means[parts.mask(name)], preview.data["suggestion"]["up"]["direction"]) * metres_per_unit
-    )
+    return metres / (extent(seen.cloud.means[parts.mask(name)], preview.up.direction) * preview.metres_per_unit)
 
 
 def extent(points: Tensor, up: Sequence[float]) -> float:
@@ -295,7 +293,7 @@ def _place(name: str, number: int, seen: Seen) -> Tensor:
     return view[:3, :3].T @ (depth * ray.double() - view[:3, 3])
 
 
-def plan_text(preview: Preview, background: Sequence[float], still: float | None, scaled: str, folder: Path) -> str:
+def plan_text(preview: Suggestion, background: Sequence[float], still: float | None, scaled: str, folder: Path) -> str:
     """The fit file.
 
     Args:
@@ -305,18 +303,15 @@ def plan_text(preview: Preview, background: Sequence[float], still: float | None
         scaled: ``length`` if one is known, ``gravity`` if the weight is to tell it; empty if neither.
         folder: Of the fit file.
     """
-    guess = preview.data["suggestion"]
-    material = yaml.safe_load(preview.starter)["material"]
     assumed = ["mass", *(() if scaled else ("length",)), *(() if still is not None else ("camera",))]
-    low, high = (float(f"{material['E'] * factor:.1e}") for factor in (SOFTER, STIFFER))
+    low, high = (float(f"{preview.youngs_modulus * factor:.1e}") for factor in (SOFTER, STIFFER))
     middle, half = 0.0, 200.0  # more than all ways round, so that none is at an end of the range
-    if guess["hold"]["end"] == "side":  # a flag flies away from its pole
-        middle, half = math.degrees(math.atan2(guess["flow"][1], guess["flow"][0])), 120.0
+    if preview.hold.name == "side":  # a flag flies away from its pole
+        middle, half = math.degrees(math.atan2(preview.flow[1], preview.flow[0])), 120.0
     around = [round(middle - half), round(middle + half)]
     first, last = (-1.0, 0.1) if still is None else (0.0, round(still + 0.1, 2))
     still = still or 0.0
-    metres = guess["metres_per_unit"]
-    sizes = [float(f"{metres * factor:.2g}") for factor in (SHORTER, LONGER)]
+    sizes = [float(f"{preview.metres_per_unit * factor:.2g}") for factor in (SHORTER, LONGER)]
     again = program.command("fit", "--config", folder / PLAN, "--output", folder / RESULT)
     lines = [
         (f"base: {LOOK}/starter.yaml", "the splat, what holds it, its material: guesses, on a coarse grid"),
@@ -324,8 +319,8 @@ def plan_text(preview: Preview, background: Sequence[float], still: float | None
         ("known:", "replaces what the base says"),
         ("  wind.effects: []", "a steady wind"),
         (f"  background: {list(background)}", "around the splat in the film"),
-        (f"  material.density: {material['density']:g}", "kg/m3; not measured"),
-        (f"  material.thickness: {material['thickness']:.4g}", "m; with the density it makes the mass of an area"),
+        (f"  material.density: {preview.density:g}", "kg/m3; not measured"),
+        (f"  material.thickness: {preview.thickness:.4g}", "m; with the density it makes the mass of an area"),
         (f"assumed: [{', '.join(assumed)}]", "not measured; the result says what follows"),
         ("unknowns:", "with the ranges in which they are sought"),
         (f"  wind.speed: {{range: {list(SPEED)}}}", "m/s"),
@@ -340,18 +335,16 @@ def plan_text(preview: Preview, background: Sequence[float], still: float | None
     return head + "".join(f"{line:<44}# {told}\n" for line, told in lines)
 
 
-def _guesses(preview: Preview, told: Sequence[str], scaled: str) -> list[str]:
-    guess = preview.data["suggestion"]
-    hold = guess["hold"]
-    lines = list(told)
-    if guess["up"]["confidence"] != "given":
-        direction = [round(part, 2) for part in guess["up"]["direction"]]
-        lines.append(f"guessed: up is {direction} (confidence {guess['up']['confidence']})")
-    if hold["confidence"] != "given":
-        lines.append(f"guessed: held at the {hold['end']} (confidence {hold['confidence']}): {hold['reason']}")
-    if guess["parts"] is not None:
-        lines.append("parts: " + ", ".join(f"{n} {p['role']}" for n, p in guess["parts"]["parts"].items()))
-    size = " x ".join(f"{side:.3g}" for side in guess["size_m"])
+def _guesses(preview: Suggestion, told: Sequence[str], scaled: str) -> list[str]:
+    up, hold, lines = preview.up, preview.hold, list(told)
+    if up.confidence != "given":
+        direction = [round(part, 2) for part in up.direction]
+        lines.append(f"guessed: up is {direction} (confidence {up.confidence})")
+    if hold.confidence != "given":
+        lines.append(f"guessed: held at the {hold.name} (confidence {hold.confidence}): {'; '.join(hold.reasons)}")
+    if preview.parts is not None:
+        lines.append("parts: " + ", ".join(f"{part.name} {part.role}" for part in preview.parts.parts.parts))
+    size = " x ".join(f"{side:.3g}" for side in preview.size)
     known = {
         "length": "as --length says",
         GRAVITY: "a guess: the weight is to tell it",

@@ -7,10 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from gaussian_swaying.preview.cost import Cost, estimate_cost, predicted_spacing
-from gaussian_swaying.preview.suggest import QUALITIES
 from gaussian_swaying.simulation.body import suggest_spacing
 from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.suggestion.cost import Cost, estimate_cost
+from gaussian_swaying.suggestion.suggest import QUALITIES
 from gaussian_swaying.viewer.changes import changed_settings
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ MARGIN = 1.2  # a grid is tried that should be so many times faster still: a tri
 TRIALS = 2  # of other grids than the configured one
 CLOSE = 0.1  # another trial on a grid that is so close would tell nothing
 BUDGET = 0.5  # s; for the frames of a trial
+SURFACE = 3.0  # power of 1 / dx with which the time grows for a surface
 MOTION = 2.0  # s of motion whose cost is estimated
 
 
@@ -83,7 +84,7 @@ def finest_in_real_time(
         return first, first
     tried = [first]
     for _ in range(TRIALS):
-        dx = predicted_spacing(tried, wish / MARGIN, configured, coarsest)
+        dx = _predicted(tried, wish / MARGIN, configured, coarsest)
         if any(dx == cost.dx or (cost.total_seconds <= wish and abs(dx / cost.dx - 1) < CLOSE) for cost in tried):
             break
         try:
@@ -94,6 +95,20 @@ def finest_in_real_time(
     if fitting:
         return first, min(fitting, key=lambda cost: cost.dx)
     return first, min(tried, key=lambda cost: cost.total_seconds)
+
+
+def _predicted(tried: list[Cost], seconds: float, finest: float, coarsest: float) -> float:
+    """The finest grid spacing on which a motion should take at most some time [m], rounded up to two digits.
+
+    The time grows with a power of 1 / dx: that between the two grids nearest to the time, or the third of a surface.
+    """
+    near, *others = sorted(tried, key=lambda cost: abs(math.log(cost.total_seconds / seconds)))
+    power = SURFACE
+    if others and abs(math.log(others[0].dx / near.dx)) > CLOSE:
+        power = math.log(others[0].total_seconds / near.total_seconds) / math.log(near.dx / others[0].dx)
+    dx = near.dx * (near.total_seconds / seconds) ** (1 / min(max(power, 1.0), 4.0))
+    unit = 10.0 ** (math.floor(math.log10(dx)) - 1)
+    return min(max(float(f"{math.ceil(dx / unit - 1e-6) * unit:.2g}"), finest), coarsest)
 
 
 def sentence(configured: float, chosen: float, configured_speed: float, speed: float) -> str:

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
 
 from gaussian_swaying._inputs import spare_memory
-from gaussian_swaying.config.parser import parse_text
 from gaussian_swaying.gaussians.formats import read_gaussians
-from gaussian_swaying.preview.starter import starter_yaml
-from gaussian_swaying.preview.suggest import as_its_kind, suggest
-from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.suggestion.suggest import suggest
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
@@ -44,20 +40,10 @@ def settings_of_splat(
         tell: Called with the share that is done, from 0 to 1, and the name of the next task.
         quick: Whether the grid is a coarser one than that of its starter.
     """
-    file = Path(path).resolve()
     tell(0.05, "Reading the splat")
     with spare_memory(SPARE):
-        gaussians = read_gaussians(file)
-    tell(0.15, "Looking for a region, pins and a grid")
-    found = suggest(gaussians, quality="draft" if quick else "normal")
-    if found.parts is not None:
-        saved = found.parts.parts.save(folder / "parts.npz")
-        found = replace(found, parts=replace(found.parts, path=str(saved)))
-    own = ["--device", device.type]
-    tell(0.35, "Finding how it sways")
-    simulation = Simulation.from_settings(parser, parse_text(parser, starter_yaml(found, str(file)), own))
-    found = as_its_kind(found, simulation)
-    if found.parts is not None:
-        found.parts.parts.save(folder / "parts.npz")
-    text = starter_yaml(found, str(file))
-    return parse_text(parser, text, [*own, *further])
+        gaussians = read_gaussians(path)
+    tell(0.15, "Looking for a region, pins, a grid and how it sways")
+    found = suggest(gaussians, quality="draft" if quick else "normal", device=device.type)
+    found.to_yaml(folder / "starter.yaml", splat=Path(path))
+    return parser.parse_args(["--config", str(folder / "starter.yaml"), "--device", device.type, *further])

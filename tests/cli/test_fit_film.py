@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import subprocess
-from types import SimpleNamespace
 
 import imageio_ffmpeg
 import numpy as np
@@ -18,7 +17,6 @@ from gaussian_swaying.cli import fit_film
 from gaussian_swaying.cli.camera import painter_of
 from gaussian_swaying.cli.fit import main
 from gaussian_swaying.cli.fit_film import Seen, extent, longest_side, plan_text, upright_in
-from gaussian_swaying.cli.preview import build_options, preview_scene
 from gaussian_swaying.fitting.before import HELD, MOVING
 from gaussian_swaying.fitting.film import first_frame, open_film
 from gaussian_swaying.fitting.plan import read_plan
@@ -27,6 +25,7 @@ from gaussian_swaying.fitting.videos import read_videos
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.recording.video import VideoEncoder
 from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
+from gaussian_swaying.suggestion.suggest import guess
 
 pytest.importorskip("cv2")
 
@@ -100,8 +99,7 @@ def test_a_film_that_does_not_say_its_length(case, checked, tmp_path):
 def seen(case):
     """The first frame with its true camera, and the preview of the splat."""
     film, cloud, camera = open_film(case / "film.mp4"), read_gaussians(case / "my.ply", 0), camera_of(270, 480)
-    preview = preview_scene(build_options().parse_args([str(case / "my.ply"), "--device=cpu"]), case / "look")
-    return Seen(film, first_frame(film), cloud, camera, painter_of(cloud)(camera), 0.0), preview
+    return Seen(film, first_frame(film), cloud, camera, painter_of(cloud)(camera), 0.0), guess(cloud)
 
 
 def test_known_lengths(seen):
@@ -154,22 +152,14 @@ def test_a_fit_without_a_length_keeps_the_edited_file(case, checked, capsys):
 
 def test_the_weight_as_a_ruler(case, checked, capsys, monkeypatch):
     """The length of a scene unit is sought; what was captured in balance with its weight, as a plant, is refused."""
-    previewed = fit_film._previewed
-
-    def weightless(*given):
-        preview = previewed(*given)
-        starter = yaml.safe_load(preview.starter)
-        assert starter["solver"]["gravity"][2] == -9.8  # a flag is not in balance
-        starter["solver"]["gravity"] = [0.0, 0.0, 0.0]
-        return dataclasses.replace(preview, starter=yaml.safe_dump(starter))
-
-    monkeypatch.setattr(fit_film, "_previewed", weightless)
+    found = guess(read_gaussians(case / "my.ply", 0))
+    assert found.falls  # a flag is not in balance
+    weightless = dataclasses.replace(found, kind="shrub")
+    monkeypatch.setattr(fit_film, "_previewed", lambda *given: weightless)
     assert _check(case, case / "weighed", "--length", "gravity") == 2
     assert "captured in balance" in capsys.readouterr().err
-    starter = (checked / "preview/starter.yaml").read_text()
-    guess = {"metres_per_unit": 0.5, "hold": {"end": "top"}, "flow": [1.0, 0.0, 0.0]}
-    preview = SimpleNamespace(data={"suggestion": guess}, starter=starter)
-    (checked / "weighed.yaml").write_text(plan_text(preview, [0.5, 0.5, 0.5], 0.1, "gravity", checked))
+    hangs = dataclasses.replace(found, metres_per_unit=0.5, hold=dataclasses.replace(found.hold, name="top"))
+    (checked / "weighed.yaml").write_text(plan_text(hangs, [0.5, 0.5, 0.5], 0.1, "gravity", checked))
     plan = read_plan(checked / "weighed.yaml")
     (scale,) = [u for u in plan.unknowns if u.name == SCALE]
     assert (scale.low, scale.high) == (0.12, 2.0)

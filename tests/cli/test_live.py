@@ -9,6 +9,7 @@ import urllib.request
 import pytest
 import torch
 from shared import refused
+from small_scenes import run_cost
 
 from gaussian_swaying.cli import live, scene
 from gaussian_swaying.cli.preview import main as preview
@@ -16,7 +17,6 @@ from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.gaussians.export import export_cloud
 from gaussian_swaying.gaussians.ply import write_ply
-from gaussian_swaying.preview.cost import Cost
 from gaussian_swaying.scenes.alocasia import AlocasiaScene
 from gaussian_swaying.scenes.flag_on_stand import FlagOnStandScene
 from gaussian_swaying.scenes.procedural import FlagScene
@@ -144,20 +144,8 @@ def test_the_grid_is_chosen_for_real_time_unless_it_is_given(capsys, monkeypatch
 def cubed(simulation, frames, budget, pictures):
     """Costs of a made-up machine, which grow as 1 / dx³."""
     finer = 0.04 / simulation.solver.dx
-    return Cost(
-        device="",
-        particles=1,
-        dx=simulation.solver.dx,
-        grid=(1, 1, 1),
-        frames=frames,
-        wave_speed=1.0,
-        stable_substep=1.0,
-        substep=1.0,
-        substeps=1,
-        substep_seconds=1e-3 * finer**2,
-        simulation_seconds=(frames - 1) * simulation.frame_dt / 0.5 * finer**3,
-        picture_seconds=None,
-    )
+    seconds = (frames - 1) * simulation.frame_dt / 0.5 * finer**3
+    return run_cost(simulation.solver.dx, substep_seconds=1e-3 * finer**2, simulation_seconds=seconds)
 
 
 def test_ctrl_c_ends_it_cleanly(tmp_path):

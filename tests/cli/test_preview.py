@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import re
 import shlex
 import struct
 from pathlib import Path
@@ -10,13 +11,15 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from places import place
 from shared import refused
-from small_scenes import together
+from small_scenes import plain_cloud, together
+from things import potted_plant
 
 from gaussian_swaying.cli.preview import main
 from gaussian_swaying.cli.simulate import main as simulate
+from gaussian_swaying.gaussians.parts import Parts
 from gaussian_swaying.gaussians.ply import read_ply, write_ply
-from gaussian_swaying.preview.cost import Cost
 from gaussian_swaying.scenes.procedural import FlagScene
 
 ROOT = Path(__file__).parents[2]
@@ -26,7 +29,7 @@ FLAG = ROOT / "configs/sim/flag.yaml"
 @pytest.fixture(autouse=True)
 def _few_frames(monkeypatch):
     """Of those that are timed, which is tested in test_cost.py."""
-    monkeypatch.setattr("gaussian_swaying.preview.cost.MOST_FRAMES", 2)
+    monkeypatch.setattr("gaussian_swaying.suggestion.cost.MOST_FRAMES", 2)
 
 
 def test_where_map_coordinates_begin(tmp_path, capsys):
@@ -66,15 +69,12 @@ def test_the_report_and_its_files(splat, tmp_path, capsys):
     assert sorted(path.name for path in out.iterdir()) == ["preview.json", "preview.png", "starter.yaml"]
     data = json.loads((out / "preview.json").read_text())
     assert data["suggestion"]["up"]["direction"] == [0, 0, 1]
-    assert data["suggestion"]["hold"]["end"] == "side"
-    assert data["run"]["held"] == 30  # three columns of ten
+    assert data["suggestion"]["hold"]["name"] == "side"
     assert data["cost"]["frames"] == 3
     assert data["cost"]["total_seconds"] > data["cost"]["startup_seconds"] > 0
     assert "the starter (0.12 s" in report
-    assert "draft.yaml" not in report
     for words in ("150 Gaussians", "confidence medium", "dx = 0.14 m", f"--config {out / 'starter.yaml'}"):
         assert words in report
-    assert "a floor" not in report
 
 
 def test_ten_lines_and_a_command_for_a_shell(splat, tmp_path, capsys):
@@ -88,7 +88,7 @@ def test_ten_lines_and_a_command_for_a_shell(splat, tmp_path, capsys):
     assert main([*options, "--device", "cpu"]) == 0
     told, said = capsys.readouterr()
     lines = [line for line in told.splitlines() if "warning" not in line and "# the next best" not in line]
-    assert len(lines) == 10 < len(whole.splitlines()) / 3
+    assert len(lines) == 10 < len(whole.splitlines()) / 2
     assert told.splitlines()[1].split(";")[0] in whole
     assert shlex.split(lines[-2])[2:4] == ["--config", str(folder / "out/starter.yaml")]
     assert lines[-1].endswith("starter.yaml; --verbose says more")
@@ -110,7 +110,6 @@ def test_specks_are_noted_and_follow(splat, tmp_path, capsys):
     report = capsys.readouterr().out
     assert "note: 4 specks hang on nothing or by a thread; they follow their nearest neighbours" in report
     assert "warning" not in report
-    assert json.loads((out / "preview.json").read_text())["run"]["loose"] == 4
     small = ["--camera.init_args.width", "32", "--camera.init_args.height", "18", "--recorder.video", "false"]
     assert yaml.safe_load((out / "starter.yaml").read_text())["scene"]["loose"] == "carry"
     run = tmp_path / "run"
@@ -123,7 +122,7 @@ def test_a_material_may_be_given(splat, tmp_path, capsys):
     """And none of its numbers is that of a kind."""
     out = tmp_path / "out"
     assert preview(splat, out, "--material", "rubber", "--frames", "2") == 0
-    assert "rubber, E = 2e+06 Pa, 925 kg/m^3, 0.002 m thick: as it was given" in capsys.readouterr().out
+    assert "rubber, E = 2e+06 Pa, 925 kg/m^3, 0.002 m thick; as it was given" in capsys.readouterr().out
     assert json.loads((out / "preview.json").read_text())["suggestion"]["material"] == "rubber"
     assert yaml.safe_load((out / "starter.yaml").read_text())["material"] == "rubber"
     given = ["--output", str(tmp_path / "other"), "--material", "ruber"]
@@ -142,67 +141,58 @@ def test_edited_starter_is_kept(splat, tmp_path):
     assert not (out / "starter.3.yaml").exists()
 
 
-@pytest.fixture
-def dense(tmp_path):
-    """A flag that is fine enough for every quality."""
-    path = tmp_path / "dense.ply"
-    write_ply(path, FlagScene(spacing=0.012).generate())
-    return path
+@pytest.mark.parametrize(("quality", "dx"), [("draft", 0.062), ("normal", 0.042)])
+def test_a_quality_chooses_the_grid_of_the_starter(tmp_path, quality, dx):
+    write_ply(tmp_path / "dense.ply", FlagScene(spacing=0.015).generate())
+    assert preview(tmp_path / "dense.ply", tmp_path, "--quality", quality, "--frames", "2") == 0
+    assert yaml.safe_load((tmp_path / "starter.yaml").read_text())["solver"]["dx"] == dx
 
 
-def _spacing(folder):
-    return yaml.safe_load((folder / "starter.yaml").read_text())["solver"]["dx"]
-
-
-@pytest.mark.slow(gate=["normal-0.042"])
-@pytest.mark.parametrize(("quality", "dx"), [("draft", 0.062), ("normal", 0.042), ("fine", 0.021)])
-def test_a_quality_chooses_the_grid_of_the_starter(dense, tmp_path, capsys, quality, dx):
-    assert preview(dense, tmp_path, "--quality", quality, "--frames", "10") == 0
-    report = capsys.readouterr().out
-    data = json.loads((tmp_path / "preview.json").read_text())
-    assert data["suggestion"]["quality"] == quality
-    assert f"quality         {quality}: " in report
-    assert set(data["qualities"]) == {"draft", "normal", "fine"} - {quality}
-    for name, other in data["qualities"].items():
-        assert f"with dx = {other['dx_m']:g} m (--quality {name})" in report
-        finer = other["dx_m"] < data["cost"]["dx"]
-        assert (other["total_seconds"] > data["cost"]["total_seconds"]) == finer
-    assert "(--quality " + quality not in report
-    assert _spacing(tmp_path) == dx
-
-
-@pytest.mark.parametrize(
-    ("seconds_per_node", "minutes", "dx", "words"),
-    [
-        (1.0, 1e4, 0.02, "the finest for Gaussians so far apart"),
-        (10.0, 2.0, 0.054, "the finest grid that takes at most 2 min"),
-        (10.0, 0.01, 0.062, "warning: Even a draft takes about 88 s, longer than 600 ms: ask for fewer `--frames`."),
-    ],
-)
-def test_minutes_choose_the_grid_of_the_starter(
-    dense, tmp_path, capsys, monkeypatch, seconds_per_node, minutes, dx, words
-):
-    """With a run that takes a time in proportion to 1 / dx²."""
-    measured = []
-
-    def estimate(simulation, frames, startup_seconds=0.0):
-        measured.append(simulation.solver.dx)
-        seconds = seconds_per_node * 0.034 / simulation.solver.dx**2
-        substep = seconds * simulation.solver.dx  # of 1 / dx of them
-        return Cost("", 1, simulation.solver.dx, (1, 1, 1), frames, 1.0, 1.0, 0.04, 1, substep, seconds, None)
-
-    monkeypatch.setattr("gaussian_swaying.cli.preview.estimate_cost", estimate)
+def test_parts_are_written_and_those_that_were_edited_are_kept(tmp_path, capsys):
+    write_ply(tmp_path / "plant.ply", potted_plant(0.02))
     out = tmp_path / "out"
-    assert preview(dense, out, "--minutes", str(minutes)) == 0
-    assert _spacing(out) == dx
-    report = capsys.readouterr().out
-    assert words in report
-    assert report.count("warning") == words.count("warning")
-    data = json.loads((out / "preview.json").read_text())
-    assert data["cost"]["dx"] == data["run"]["dx_m"] == dx
-    assert set(data["qualities"]) == {"draft", "normal", "fine"}
-    assert len(measured) <= 5  # the draft, the starter, and a few more
-    assert f"Quality: --minutes {minutes:g}." in (out / "starter.yaml").read_text()
+    given = ["--quality", "draft", "--frames", "2"]
+    assert preview(tmp_path / "plant.ply", out, *given) == 0
+    told = capsys.readouterr().out
+    assert "pot still" in told
+    assert "each connected part has its own (scene.connected: surface), as" in told
+    assert str(out / "parts.npz") in told
+    config = yaml.safe_load((out / "starter.yaml").read_text())
+    assert config["scene"]["parts"] == str(out / "parts.npz")
+    assert (config["solver"]["boundaries"], config["scene"]["connected"]) == ([], "surface")
+    parts = Parts.load(out / "parts.npz")
+    painted = Parts(parts.labels.flip(0), parts.parts)
+    painted.save(out / "parts.npz")
+    for _ in range(2):
+        assert preview(tmp_path / "plant.ply", out, *given) == 0
+    assert Parts.load(out / "parts.1.npz").digest() == painted.digest()
+    assert Parts.load(out / "parts.npz").digest() == parts.digest()
+    assert not (out / "parts.2.npz").exists()
+
+
+def test_a_thing_of_a_place_is_chosen_by_its_number(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("gaussian_swaying.cli.preview.LARGE", 0)
+    write_ply(tmp_path / "garden.ply", place(20_000, sh_degree=1)[0])
+    out = tmp_path / "out"
+    assert preview(tmp_path / "garden.ply", out, "--move", "2, 2", "--frames", "2", "--quality", "draft") == 0
+    told = capsys.readouterr().out
+    for words in ("only constant colours were read", "2 moves", "thing 2 of the place", "background"):
+        assert words in told
+    assert (out / "things.png").exists()
+    found = json.loads((out / "preview.json").read_text())["suggestion"]
+    assert (found["place"]["moves"], len(found["place"]["things"])) == ([2], 2)
+
+
+def test_a_weak_guess_comes_with_the_command_of_the_next_best(tmp_path, capsys):
+    """Of the object, too: clusters of a dozen, of which none is known to be it."""
+    torch.manual_seed(0)
+    places = (100 * torch.rand(200, 3)).repeat_interleave(12, 0) + 0.1 * torch.randn(2400, 3)
+    write_ply(tmp_path / "a b.ply", plain_cloud(places, math.log(0.5)))
+    assert preview(tmp_path / "a b.ply", tmp_path / "out", "--frames", "2") == 0
+    told = capsys.readouterr().out
+    assert re.search(r"warning: that these \d+ Gaussians are the object is a weak guess", told)
+    assert re.search(r"'.*a b.ply' .*--region (-?[\d.]+ ){6}.*# as guessed: give another box", told)
+    assert re.search(r"--up [+-][xyz].*# the next best", told)
 
 
 def test_options_replace_guesses(splat, tmp_path, capsys):
@@ -210,7 +200,7 @@ def test_options_replace_guesses(splat, tmp_path, capsys):
     found = json.loads((tmp_path / "a/preview.json").read_text())["suggestion"]
     assert found["up"]["direction"] == [0, -1, 0]
     assert found["hold"]["direction"] == [1, 0, 0]
-    assert found["longest_side_m"] == 2
+    assert found["longest_side"] == 2
     starter = yaml.safe_load((tmp_path / "a/starter.yaml").read_text())
     assert starter["scene"]["up"] == [0, -1, 0]
     said = capsys.readouterr().out
@@ -222,7 +212,7 @@ def test_options_replace_guesses(splat, tmp_path, capsys):
     there = f"([{flow[0]:.3g}, 0, {flow[1]:.3g}] in scene axes)"
     assert there in (tmp_path / "a/starter.yaml").read_text()
     assert there in said
-    assert other["run"]["simulated"] == 80  # 8 of 15 columns of 10
+    assert other["suggestion"]["region"]["simulated"] == 80  # 8 of 15 columns of 10
 
 
 def test_a_configuration_is_previewed_as_it_is(splat, tmp_path, capsys):
@@ -238,10 +228,8 @@ def test_a_configuration_is_previewed_as_it_is(splat, tmp_path, capsys):
     assert preview(splat, tmp_path / "out", "--config", str(mine)) == 0
     report = capsys.readouterr().out
     data = json.loads((tmp_path / "out/preview.json").read_text())
-    assert data["run"]["simulated"] == 15 * 6
-    assert data["run"]["held"] == 6
-    assert data["run"]["flow"] == [1, 2, 0]
-    assert "wind            [1, 2, 0] m/s, z up, before modulations" in report
+    for words in ("  90 of 150 Gaussians", "wind            [1, 2, 0] m/s, z up, before modulations"):
+        assert words in report
     assert data["cost"]["frames"] == 7
     assert data["cost"]["picture_seconds"] is None
     assert "PinnedRegion: 6 particles" in report
@@ -268,10 +256,8 @@ def test_bad_input_is_one_sentence(splat, tmp_path, capsys):
         (splat, ["--frames", "0"], "`--frames`"),
         (splat, ["--height", "7"], "`--height`"),
         (splat, ["--quality", "best"], "`--quality` to be one of draft, normal, fine"),
-        (splat, ["--minutes", "0"], "`--minutes`"),
-        (splat, ["--minutes", "1", "--quality", "fine"], "leave out one of them"),
-        (splat, ["--config", str(FLAG), "--quality", "fine"], "`--quality` is for suggestions, and"),
-        (splat, ["--config", str(FLAG), "--connected", "surface"], "`--connected` is for suggestions, and"),
+        (splat, ["--config", str(FLAG), "--move", "1"], "`--move` is for suggestions, and"),
+        (splat, ["--move", "a"], "`--move` to be numbers of things"),
         (splat, ["--config", str(typo)], "dxx"),
         (splat, ["--capture", str(tmp_path / "nowhere")], "nowhere"),
         (splat, ["--config", str(tmp_path / "none.yaml")], "none.yaml"),

@@ -49,7 +49,7 @@ def test_the_wind_is_found_by_its_gradient():
 def test_a_splat_is_previewed_and_its_starter_runs(tmp_path):
     moved = load("own_splat").main(tmp_path / "own", frames=6, spacing=0.06)
     assert 0 < moved < 1
-    assert {path.name for path in (tmp_path / "own" / "preview").iterdir()} >= {"preview.png", "starter.yaml"}
+    assert {path.name for path in (tmp_path / "own").iterdir()} >= {"preview.png", "starter.yaml"}
     assert (tmp_path / "own" / "run" / "video.mp4").stat().st_size > 1000
 
 

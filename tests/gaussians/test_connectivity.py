@@ -7,7 +7,7 @@ import torch
 from shared import double
 
 from gaussian_swaying.gaussians import connectivity
-from gaussian_swaying.gaussians.connectivity import pieces, shades
+from gaussian_swaying.gaussians.connectivity import pieces
 from gaussian_swaying.geometry.groups import joined
 
 STEP = 0.1  # spacing of the points
@@ -151,16 +151,14 @@ def test_few_gaussians():
     assert len(attached_pairs(torch.zeros(5, 3))) == 10
 
 
-def test_shades_differ_in_a_cell_and_go_on_along_a_piece():
+def test_pieces_of_a_cell_are_those_of_one_sheet():
     points = torch.cat([sheet(0), sheet(1) + torch.tensor([0.0, 0.0, 4 * STEP])])
     pairs = attached_pairs(points)
     number = torch.arange(2).repeat_interleave(len(points) // 2)
     cell = ((points[:, 0] + 1) / 0.7).floor().long() * 5 + ((points[:, 1] + 1) / 0.7).floor().long()
     cell = torch.unique(cell, return_inverse=True)[1]
     piece, several = pieces(cell, pairs)
-    shade = shades(cell, piece, pairs)
     assert several[(points[:, :2] - 0.9).abs().amax(1) < 0.6].all()
-    assert len(shade[number == 0].unique()) == len(shade[number == 1].unique()) == 1
-    assert shade[0] != shade[-1]
+    assert not set(piece[number == 0].tolist()) & set(piece[number == 1].tolist())
     alone = points[number == 0]
     assert not pieces(torch.zeros(len(alone), dtype=torch.long), attached_pairs(alone))[1].any()

@@ -10,12 +10,12 @@ import json
 import pytest
 from golden.suggestions import CASES, FILE, numbers_of
 
-LOOSE = {"natural": 0.05, "youngs_modulus_Pa": 0.05, "thickness_m": 0.05, "drag": 0.05, "substeps": 0.1}
+LOOSE = {"natural": 0.05, "youngs_modulus": 0.05, "thickness": 0.05, "drag": 0.05, "substeps": 0.1}
 
 
 def check(found, expected, share, where):
     if isinstance(expected, dict):
-        assert list(found) == list(expected), where
+        assert set(found) == set(expected), where
         for key, value in expected.items():
             check(found[key], value, LOOSE.get(key, share), f"{where}.{key}")
     elif isinstance(expected, list) and not all(isinstance(value, (int, float)) for value in expected):
@@ -32,8 +32,8 @@ def check(found, expected, share, where):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_it_is_suggested_as_before(name, tmp_path):
-    found, expected = numbers_of(name, tmp_path), json.loads(FILE.read_text())[name]
+def test_it_is_suggested_as_before(name):
+    found, expected = json.loads(json.dumps(numbers_of(name))), json.loads(FILE.read_text())[name]
     start, other = found.pop("start"), expected.pop("start")
     check(found, expected, 0.005, name)
     # it lies upwind or downwind of now

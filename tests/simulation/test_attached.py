@@ -11,10 +11,10 @@ from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.preview.apart import why_apart
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
 from gaussian_swaying.simulation.body import Material, Scene, attached_points, homes, lies_apart, pieces_in_cells
 from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.suggestion.suggest import why_apart
 
 DX, GAP = 0.2, 0.13
 

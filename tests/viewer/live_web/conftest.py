@@ -64,10 +64,8 @@ def make(tmp_path_factory):
 def sway(tmp_path_factory):
     """That of the starter of a shrub, which sways by modes in a wind with turbulence."""
     folder = tmp_path_factory.mktemp("shrub")
-    preview, _ = previewed(
-        block([0.5, 0.4, 1.0], GREEN), folder, "--hold", "bottom", "--kind", "shrub", "--look", "gusts"
-    )
-    return maker(yaml.safe_load(preview.starter), tmp_path_factory)
+    previewed(block([0.5, 0.4, 1.0], GREEN), folder, hold="bottom", kind="shrub", look="gusts")
+    return maker(yaml.safe_load((folder / "starter.yaml").read_text()), tmp_path_factory)
 
 
 @pytest.fixture(scope="session")

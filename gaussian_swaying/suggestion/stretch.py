@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from gaussian_swaying.mpm.modes import Modes
+from gaussian_swaying.suggestion.measures import Array
 from gaussian_swaying.wind.field import WindField
 from gaussian_swaying.wind.force import WindForce
 
@@ -28,7 +29,7 @@ EVEN, ROUND, SHARE, LEAD = (0.0, 0.2, 0.2), (0.47, 0.85, 0.05), (0.2, 0.65, 0.1)
 ALIKE = 0.8  # minor over major axis of a motion, above which the two may be exchanged
 
 
-Motion = tuple[np.ndarray, Callable[[np.ndarray, int], np.ndarray]]
+Motion = tuple[Array, Callable[[Array, int], Array]]
 """Displacement in a long record, (S, 3), and what is left of it in samples after some (W,), (W, T, 3)."""
 
 
@@ -46,9 +47,9 @@ class Response(NamedTuple):
         taken: Real and imaginary loads on them, and what the tip moves at once, by loads on the modes, (M, 2 K + 3).
     """
 
-    root: np.ndarray
-    out: np.ndarray
-    taken: np.ndarray
+    root: Array
+    out: Array
+    taken: Array
 
 
 def typical_start(motion: Motion, frequency: float, tonal: bool = True) -> float:
@@ -65,13 +66,12 @@ def typical_start(motion: Motion, frequency: float, tonal: bool = True) -> float
     rate, (moved, ringing) = rate_for(frequency), motion
     length = round(max(SHORTEST, PERIODS / frequency) * rate)
     skipped, settled = round(SKIPPED * rate), round(min(20 / frequency, 60.0) * rate)
-    whole = moved[settled:]
     begin = np.arange(settled, len(moved) - length, max(1, round(STEP * rate)))
     faults = []
     for some in np.array_split(begin, max(1, len(begin) // TOGETHER)):
         part = moved[some[:, None] + np.arange(length)] - ringing(some, length)
-        faults.append(_faults(part[:, skipped:], whole, frequency / rate if tonal else math.inf))
-    return float(begin[int(np.argmin(np.concatenate(faults)))] / rate)
+        faults.append(_faults(part[:, skipped:], moved[settled:], frequency / rate if tonal else math.inf))
+    return float(begin[np.concatenate(faults).argmin()] / rate)
 
 
 def linear_motion(bound: Modes, force: WindForce, wind: WindField, top: torch.Tensor, rate: float) -> Motion:
@@ -91,25 +91,22 @@ def linear_motion(bound: Modes, force: WindForce, wind: WindField, top: torch.Te
     grouped, aero = bound._grouped(force), force.aero
     assert isinstance(grouped, WindForce)
     assert grouped.sums is not None
-    tensor, area = grouped.sums.tensor.double().cpu(), grouped.sums.area.double().cpu()
-    eye = torch.eye(3, dtype=torch.float64)
-    drag, friction = float(aero.C_D), float(aero.C_F)
-    pressed = 0.5 * aero.air_density * (drag * tensor + friction * (area[:, None, None] * eye - tensor))
-    shape = bound.site_shape.double().cpu().unflatten(0, (-1, 3))
-    pull = pressed @ shape  # of a unit of |u| u, shape (S, 3, M)
-    place = bound.site_rest.double().cpu()
-    square, flow = bound.square.double().cpu(), wind.flows[0].double().cpu()
-    along = torch.nn.functional.normalize(flow, dim=0)
-    weight = pressed * flow.norm() @ (eye + torch.outer(along, along))
-    damping = torch.diag(2 * bound.ratio.double().cpu() * square.sqrt())
-    damping = damping + shape.flatten(0, 1).T @ (weight @ shape).flatten(0, 1)
-    tip = (top[:, None, None] * shape).sum(0)
-    centre, label = kmeans2(place.numpy(), min(PLACES, len(place)), seed=0, minit="++")
-    response = _response(square.numpy(), damping.numpy(), tip.numpy(), FASTEST * bound.first)
-    pull = pull @ torch.from_numpy(response.taken)
-    of_place = torch.zeros(len(centre), 3, pull.shape[-1], dtype=torch.float64)
-    of_place.index_add_(0, torch.from_numpy(label).long(), pull)
-    return _motion(_push(wind, torch.from_numpy(centre), of_place, rate), response, rate)
+    tensor, area = (of.double().cpu().numpy() for of in (grouped.sums.tensor, grouped.sums.area))
+    drag, friction, eye = float(aero.C_D), float(aero.C_F), np.eye(3)
+    pressed = 0.5 * aero.air_density * ((drag - friction) * tensor + friction * area[:, None, None] * eye)
+    shape = bound.site_shape.double().cpu().unflatten(0, (-1, 3)).numpy()  # (S, 3, M)
+    square, flow = bound.square.double().cpu().numpy(), wind.flows[0].double().cpu().numpy()
+    speed = np.linalg.norm(flow)
+    weight = pressed @ (speed * eye + np.outer(flow, flow) / speed)
+    flat = shape.reshape(-1, len(square))
+    damping = np.diag(2 * bound.ratio.double().cpu().numpy() * np.sqrt(square))
+    damping += flat.T @ (weight @ shape).reshape(flat.shape)
+    centre, label = kmeans2(bound.site_rest.double().cpu().numpy(), min(PLACES, len(shape)), seed=0, minit="++")
+    response = _response(square, damping, np.tensordot(top.numpy(), shape, 1), FASTEST * bound.first)
+    pull = pressed @ shape @ response.taken  # of a unit of |u| u
+    of_place = np.zeros((len(centre), *pull.shape[1:]))
+    np.add.at(of_place, label, pull)
+    return _motion(_push(wind, centre, of_place, rate), response, rate)
 
 
 def cloth_motion(wind: WindField, places: torch.Tensor, frequency: float, ratio: float) -> Motion:
@@ -122,48 +119,49 @@ def cloth_motion(wind: WindField, places: torch.Tensor, frequency: float, ratio:
         ratio: Damping ratio, with that of the air.
     """
     rate, omega = rate_for(frequency), 2 * math.pi * frequency
-    air = _air(wind, places.double().cpu(), rate, SAMPLES, 0).mean(1)
-    push = (air.norm(dim=-1, keepdim=True) * air).numpy()
+    push = _pressed(_air(wind, places.double().cpu().numpy(), rate, SAMPLES, 0).mean(1))
     response = _response(np.full(3, omega**2), 2 * ratio * omega * np.eye(3), np.eye(3), math.inf)
     return _motion(push @ response.taken, response, rate)
 
 
-def _push(wind: WindField, places: torch.Tensor, pull: torch.Tensor, rate: float) -> np.ndarray:
+def _pressed(air: Array) -> Array:
+    return np.linalg.norm(air, axis=-1, keepdims=True) * air
+
+
+def _push(wind: WindField, places: Array, pull: Array, rate: float) -> Array:
     """Loads in a long record, (T, C), by places (K, 3) and what |u| u pulls there, (K, 3, C).
 
     What the wind carries comes to the places on one line along it one after the other.
     """
     from scipy.cluster.vq import kmeans2
 
-    flow = wind.flows[0].double().cpu()
-    along = torch.nn.functional.normalize(flow, dim=0)
-    down = places @ along
-    across = places - down[:, None] * along
-    line, label = kmeans2(across.numpy(), min(LINES, len(places)), seed=0, minit="++")
-    late = (down / flow.norm() * rate).numpy()  # in samples
-    before, first = math.ceil(late.max()) + 1, math.floor(late.min())
-    air = _air(wind, torch.from_numpy(line), rate, SAMPLES + before - first, before)
-    pressed = (air.norm(dim=-1, keepdim=True) * air).numpy()
+    flow = wind.flows[0].double().cpu().numpy()
+    speed = np.linalg.norm(flow)
+    down = places @ flow / speed
+    across = places - down[:, None] * flow / speed
+    line, label = kmeans2(across, min(LINES, len(places)), seed=0, minit="++")
+    late = down / speed * rate  # in samples
+    before, whole = math.ceil(late.max()) + 1, np.floor(late).astype(int)
+    pressed = _pressed(_air(wind, line, rate, SAMPLES + before - whole.min(), before))
     push = np.zeros((SAMPLES, pull.shape[-1]))
     for some in np.array_split(np.arange(len(late)), max(1, len(late) // BLOCK)):
         at = []
         for k in some:
-            n, here = math.floor(late[k]), pressed[:, label[k]]
-            begin, share = before - n, late[k] - n
+            begin, share, here = before - whole[k], late[k] - whole[k], pressed[:, label[k]]
             at.append((1 - share) * here[begin : begin + SAMPLES] + share * here[begin - 1 : begin - 1 + SAMPLES])
-        push += np.concatenate(at, 1) @ pull[some].flatten(0, 1).numpy()
+        push += np.concatenate(at, 1) @ pull[some].reshape(-1, pull.shape[-1])
     return push
 
 
-def _air(wind: WindField, places: torch.Tensor, rate: float, samples: int, before: int) -> torch.Tensor:
+def _air(wind: WindField, places: Array, rate: float, samples: int, before: int) -> Array:
     """Wind at places (K, 3) in a record that begins some samples ``before`` time zero [m/s], shape (T, K, 3)."""
-    times = (torch.arange(samples, dtype=torch.float64) - before) / rate
-    flow = wind.flows[0].double().cpu()  # carries the turbulence, so an earlier place is a later time
-    where = (places - times[:, None, None] * flow).reshape(-1, 3).float()
-    return wind.at(torch.zeros((), dtype=torch.float64), where).double().reshape(len(times), -1, 3)
+    times = (np.arange(samples) - before) / rate  # the flow carries the turbulence, so an earlier place is a later time
+    where = places - times[:, None, None] * wind.flows[0].double().cpu().numpy()
+    found = wind.at(torch.zeros((), dtype=torch.float64), torch.from_numpy(where.reshape(-1, 3)).float())
+    return found.double().numpy().reshape(where.shape)
 
 
-def _response(square: np.ndarray, damping: np.ndarray, tip: np.ndarray, fastest: float) -> Response:
+def _response(square: Array, damping: Array, tip: Array, fastest: float) -> Response:
     """How a tip (3, M) answers to loads on modes of squares of frequencies (M,) and damping [1/s], (M, M).
 
     Vibrations faster than some circular frequency follow the load at once.
@@ -172,37 +170,32 @@ def _response(square: np.ndarray, damping: np.ndarray, tip: np.ndarray, fastest:
     root, left = np.linalg.eig(np.block([[zero, np.eye(len(zero))], [-np.diag(square), -damping]]))
     into, out = np.linalg.inv(left)[:, len(zero) :], tip @ left[: len(zero)]
     out = out * np.where(root.imag > 0, 2.0, 1.0)  # with its conjugate
-    slow = (root.imag >= 0) & (abs(root) < fastest)
-    fast = (root.imag >= 0) & ~slow
+    slow, own = np.abs(root) < fastest, root.imag >= 0
+    fast, slow = own & ~slow, own & slow
     at_once = (out[:, fast] / -root[fast]) @ into[fast]
     return Response(root[slow], out[:, slow], np.concatenate([into[slow].real, into[slow].imag, at_once.real]).T)
 
 
-def _motion(load: np.ndarray, response: Response, rate: float) -> Motion:
+def _motion(load: Array, response: Response, rate: float) -> Motion:
     """The motion of a tip under the loads of a response, (T, 2 K + 3)."""
+    from scipy.signal import lfilter
+
     count, dt = len(response.root), 1 / rate
     moved, free = load[:, 2 * count :].copy(), []
-    for k, root in enumerate(response.root):
-        decay = np.exp(root * dt * np.arange(len(load)))  # exact for steps of the load
-        amplitude = _convolved(load[:, k] + 1j * load[:, count + k], decay * (decay[1] - 1) / root)
-        moved += (amplitude[:, None] * response.out[:, k]).real
-        free.append((float(amplitude.std() * np.linalg.norm(response.out[:, k])), root, amplitude, response.out[:, k]))
+    for k, (root, way) in enumerate(zip(response.root, response.out.T, strict=True)):
+        step = np.exp(root * dt)  # exact for steps of the load, which acts from the next sample on
+        amplitude = lfilter([0, (step - 1) / root], [1, -step], load[:, k] + 1j * load[:, count + k])
+        moved += (amplitude[:, None] * way).real
+        free.append((amplitude.std() * np.linalg.norm(way), root, amplitude, way))
     free.sort(key=lambda mode: -mode[0])
 
-    def ringing(start: np.ndarray, samples: int) -> np.ndarray:
+    def ringing(start: Array, samples: int) -> Array:
         time, left = np.arange(samples) * dt, np.zeros((len(start), samples, 3))
         for _, root, amplitude, way in free[:RINGING]:
             left += ((amplitude[start][:, None] * np.exp(root * time))[..., None] * way).real
         return left
 
     return moved, ringing
-
-
-def _convolved(load: np.ndarray, answer: np.ndarray) -> np.ndarray:
-    """The sum over past samples of a load (T,) times the answer (T,) to each, from the next sample on."""
-    samples = len(load)
-    both = np.fft.ifft(np.fft.fft(load, 2 * samples) * np.fft.fft(answer, 2 * samples))[: samples - 1]
-    return np.concatenate([np.zeros(1), both])
 
 
 def _fault(value: Any, allowed: tuple[float, float, float]) -> Any:
@@ -212,29 +205,27 @@ def _fault(value: Any, allowed: tuple[float, float, float]) -> Any:
     return np.minimum(apart, 1.0) + 0.5 * apart
 
 
-def _faults(part: np.ndarray, whole: np.ndarray, frequency: float) -> np.ndarray:
+def _faults(part: Array, whole: Array, frequency: float) -> Array:
     """Faults of stretches (W, T, 3) of a record (S, 3): means, size and roundness of the fluctuation, and its spectrum.
 
     The frequency is that for each sample; where it is infinite, only the means count.
     """
-    count, half = part.shape[1], part.shape[1] // 2
-    mean, spread = np.linalg.norm(whole.mean(0)), np.linalg.norm(whole.std(0))
-    own_mean = part.mean(1)
-    apart = part - own_mean[:, None]
-    drift = np.linalg.norm(part[:, :half].mean(1) - part[:, half:].mean(1), axis=1) / mean
-    off = np.linalg.norm(own_mean - whole.mean(0), axis=1) / mean
+    count, mean, own_mean = part.shape[1], np.linalg.norm(whole.mean(0)), part.mean(1)
+    halves = part[:, : count // 2].mean(1) - part[:, count // 2 :].mean(1)
+    drift, off = (np.linalg.norm(apart, axis=1) / mean for apart in (halves, own_mean - whole.mean(0)))
     if math.isinf(frequency):
         return drift / DRIFT[2] + off / OFF[2]
+    apart = part - own_mean[:, None]
     square, axes = np.linalg.eigh(np.swapaxes(apart, 1, 2) @ apart / count)
     size = np.sqrt(square.sum(1))
     found = _fault(drift, DRIFT) + _fault(off, OFF) + _fault(size / mean, RESTLESS)
-    found = found + _fault(abs(np.log(size / spread)), EVEN)
+    found = found + _fault(abs(np.log(size / np.linalg.norm(whole.std(0)))), EVEN)
     found = found + _fault(np.sqrt(np.maximum(square[:, 1], 0) / square[:, 2]), ROUND)
     if 1.15 * frequency > 0.5:  # its own vibration is not in the record
         return found
-    time = np.linspace(-1.0, 1.0, count)
-    line = np.swapaxes(axes[:, :, 1:], 1, 2) @ np.swapaxes(apart, 1, 2)
-    line = line - (line @ time / (time @ time))[..., None] * time
+    from scipy.signal import detrend
+
+    line = detrend(np.swapaxes(axes[:, :, 1:], 1, 2) @ np.swapaxes(apart, 1, 2))
     power = np.abs(np.fft.rfft(line * np.hanning(count), 4 * count)) ** 2
     f = np.fft.rfftfreq(4 * count) / frequency
     own, seen = (f > 0.78) & (f < 1.22), f > 1.5 / count / frequency

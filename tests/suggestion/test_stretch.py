@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from gaussian_swaying.preview import stretch
-from gaussian_swaying.preview.stretch import cloth_motion, rate_for, typical_start
+from gaussian_swaying.suggestion import stretch
+from gaussian_swaying.suggestion.stretch import cloth_motion, rate_for, typical_start
 from gaussian_swaying.wind.turbulence import look
 
 
@@ -89,11 +89,11 @@ def test_modes_that_share_their_damping_are_those_of_the_matrix():
 
 def test_places_on_one_line_meet_the_same_wind_one_after_the_other():
     wind = look("gusts", seed=3)
-    places, pull = torch.tensor([[0.0, 0.2, 0.1], [1.6, 0.2, 0.1]], dtype=torch.float64), torch.zeros(2, 3, 2).double()
+    places, pull = np.array([[0.0, 0.2, 0.1], [1.6, 0.2, 0.1]]), np.zeros((2, 3, 2))
     pull[0, 0, 0] = pull[1, 0, 1] = 1.0
     push = stretch._push(wind, places, pull, 25.0)
     np.testing.assert_allclose(push[5:, 1], push[:-5, 0], rtol=1e-4)  # 1.6 m in 5 samples at 8 m/s
-    air = wind.at(torch.tensor(4.0, dtype=torch.float64), places[:1].float())[0].double()
+    air = wind.at(torch.tensor(4.0, dtype=torch.float64), torch.from_numpy(places[:1]).float())[0].double()
     assert push[100, 0] == pytest.approx(float(air.norm() * air[0]), rel=1e-3)
 
 

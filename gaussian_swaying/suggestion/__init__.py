@@ -1,0 +1,1 @@
+"""A first simulation of a captured splat: guesses with their reasons, a picture and a configuration."""

@@ -1,0 +1,296 @@
+"""Pictures of a splat with the effect of a configuration: simulated part, pins, wind and normals."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gaussian_swaying._files import is_blank
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.geometry.covariances import covariance
+from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.rendering.cameras.camera import Camera, orbit_camera, project
+from gaussian_swaying.rendering.gsplat_renderer import make_renderer
+from gaussian_swaying.rendering.thinning import DETAIL
+from gaussian_swaying.rendering.tints import HELD, greyed, tinted
+from gaussian_swaying.simulation.simulation import Roles, Simulation, classify, conditions
+from gaussian_swaying.suggestion.measures import Array, Gaussians, corners, pieces
+from gaussian_swaying.suggestion.moves import Place, nearby
+from gaussian_swaying.suggestion.up import floor_mask, wind_words
+
+Colour = tuple[int, ...]
+PUSHED, REGION, WIND = (160, 70, 200), (30, 110, 220), (0, 140, 110)
+NORMAL, INK = (200, 150, 0), (40, 40, 40)
+SOFT = ((60, 70, 220), (0, 170, 60), (170, 60, 170), (220, 150, 0))  # of several soft parts, in turn
+THING, MOST_DRAWN = 300, 200_000  # width and height of the picture of a thing [pixels]; Gaussians of it
+RADIUS = 1.9  # distance of a camera in multiples of the longest side of the shown box
+SOLID = 0.1  # opacity of what is shown
+ARROW, TIPS = 0.2, [(a, b) for a in (-0.7, 0.7) for b in (-0.8, -0.27, 0.27, 0.8)]
+"""Length of an arrow of the wind over the size of what moves, and where they end, over the half sizes across."""
+
+
+# ---- what a camera should show
+
+
+def whole_box(splat: Gaussians, simulated: Array, outside: Array, cell: float) -> tuple[list[float], list[float]]:
+    """Box of the moving part and everything connected with it, at most one longest side larger on each side.
+
+    Args:
+        splat: All Gaussians.
+        simulated: The moving part, bool, shape (N,).
+        outside: Gaussians that are not part of the object, such as a floor, bool, shape (N,).
+        cell: Points in the same or in touching cells of this size are connected [scene units].
+
+    Returns:
+        Lower and upper corner [scene units].
+    """
+    means = splat.means
+    low, high = means[simulated].min(0), means[simulated].max(0)
+    index = np.flatnonzero(simulated | (nearby(means, simulated) & ~outside & (splat.opacity >= SOLID)))
+    part, own = pieces(means[index], cell), simulated[index]
+    count = np.bincount(part, own)
+    joined = means[index[(count >= max(0.01 * own.sum(), 1))[part]]]
+    if len(joined) > own.sum():  # specks do not count
+        first, last = corners(joined, 0.002)
+        low, high = np.minimum(low, first), np.maximum(high, last)
+    return low.tolist(), high.tolist()
+
+
+def orbit_frame(whole: Sequence[Sequence[float]], moving: Sequence[Sequence[float]]) -> tuple[list[float], float]:
+    """Target and distance of an orbiting camera that shows all of an object.
+
+    Args:
+        whole: Corners of the box of the whole object [scene units].
+        moving: Corners of the box of the moving part [scene units].
+
+    Returns:
+        ``target_offset`` and ``radius`` of an orbiting camera, in multiples of the longest side of the moving part.
+    """
+    size, all_of_it = (float(np.ptp(box, axis=0).max()) for box in (moving, whole))
+    shift = (np.mean(whole, 0) - np.mean(moving, 0)) / size
+    if all_of_it < 1.02 * size and np.abs(shift).max() < 0.02:
+        return [0.0, 0.0, 0.0], RADIUS
+    return [round(float(c), 3) + 0.0 for c in shift], round(RADIUS * all_of_it / size, 2)
+
+
+def mean_flow(simulation: Simulation) -> Tensor:
+    """Flow without modulations [m/s], z up, shape (3,), float64; for a schedule its strongest entry."""
+    flows = simulation.stepper.flows().detach().cpu().double().reshape(-1, 3)
+    return flows[int(flows.norm(dim=-1).argmax())]
+
+
+def _whole(simulation: Simulation, roles: Roles) -> tuple[list[float], list[float]]:
+    """Corners of the box of the whole object, including parts that do not move [scene units]."""
+    scene, simulated = simulation.scene, roles.simulated.numpy()
+    splat = Gaussians.of(scene.model.to_cloud().to("cpu"))
+    solid = nearby(splat.means, simulated) & (splat.opacity >= SOLID)
+    outside = np.zeros_like(solid)
+    outside[solid] = floor_mask(splat[solid], scene.frame.rotation[2].numpy())
+    return whole_box(splat, simulated, outside, simulation.solver.dx / scene.frame.metres_per_unit)
+
+
+# ---- drawing
+
+
+class View:
+    """A picture and its camera, to draw on in scene units."""
+
+    def __init__(self, colours: Tensor, splat: tuple[Tensor, Tensor, Tensor], camera: Camera) -> None:
+        from PIL import Image, ImageDraw, ImageFont
+
+        means, covariances, opacity = splat
+        renderer = make_renderer(colours.device, detail=DETAIL)
+        plain = torch.full((3,), 0.96, device=colours.device)
+        image = renderer(means, covariances, opacity, colours, camera.to(colours.device), plain).color
+        self.pixels = (image.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
+        self.camera, self.picture = camera, Image.fromarray(self.pixels)
+        self.draw, self.font = ImageDraw.Draw(self.picture), ImageFont.load_default(size=14)
+
+    def lines(self, ends: Array, colour: Colour, width: int = 2) -> None:
+        """Lines between pairs of places [scene units], shape (K, 2, 3)."""
+        for a, b in self._seen(ends):
+            self.draw.line([tuple(a), tuple(b)], fill=colour, width=width)
+
+    def arrows(self, ends: Array, colour: Colour) -> None:
+        """Arrows between pairs of places [scene units], their heads in the plane of the picture."""
+        self.lines(ends, colour)
+        for a, b in self._seen(ends):
+            along = (b - a) / max(np.linalg.norm(b - a), 1e-6)
+            size = min(10.0, 0.6 * np.linalg.norm(b - a)) + 1
+            back, across = b - size * along, 0.45 * size * np.array([-along[1], along[0]])
+            self.draw.polygon([tuple(b), tuple(back + across), tuple(back - across)], fill=colour)
+
+    def box(self, low: Array, high: Array, colour: Colour, named: bool = False) -> None:
+        """The edges of a box, and the coordinates at the ends of the lowest one along each axis."""
+        corner = np.array(np.meshgrid(*zip(low, high, strict=True), indexing="ij")).reshape(3, -1).T
+        for axis, name in enumerate("xyz"):
+            first = [k for k in range(8) if not k >> (2 - axis) & 1]
+            edges = np.stack([corner[first], corner[[k + (4 >> axis) for k in first]]], 1)
+            self.lines(edges, colour)
+            if named:
+                lowest = max(self._seen(edges), key=lambda edge: edge[:, 1].mean(), default=())
+                for (x, y), corner_of in zip(lowest, (low, high), strict=False):
+                    x, y = min(max(x, 30), self.camera.width - 30), min(y + 4 + 14 * axis, self.camera.height - 14)
+                    words = f"{name} {corner_of[axis] + 0.0:.3g}"
+                    self.draw.text((x, y), words, INK, self.font, "mt", stroke_width=2, stroke_fill=(255, 255, 255))
+
+    def _seen(self, ends: Array) -> Array:
+        """Pixels of pairs of places that are in front of the camera, shape (K, 2, 2)."""
+        pixel, depth = project(torch.as_tensor(np.reshape(ends, (-1, 3))), self.camera)
+        kept = depth.reshape(-1, 2).numpy().min(1) > self.camera.near
+        return pixel.reshape(-1, 2, 2).numpy()[kept]
+
+
+@torch.no_grad()
+def preview_picture(
+    simulation: Simulation, height: int = 540, whole: tuple[Sequence[float], Sequence[float]] | None = None
+) -> Array:
+    """The scene at rest from the side of its camera and from 90 degrees to the left, with a legend.
+
+    Args:
+        simulation: A run, which need not have started.
+        height: Height of each view [pixels].
+        whole: Corners of the box to show [scene units]; that of the whole object if None.
+
+    Returns:
+        8-bit RGB, shape (H, W, 3).
+    """
+    from PIL import Image, ImageDraw
+
+    scene, roles = simulation.scene, classify(simulation)
+    frame, parts = scene.frame, scene.parts
+    soft = [] if parts is None else [part.name for part in parts.parts if part.role == "soft"]
+    tints = [(n, parts.mask(n), SOFT[k % len(SOFT)]) for k, n in enumerate(soft) if parts and len(soft) > 1]
+    x, y, z = frame.direction_to_sim(-simulation.painter.camera_at(0).world_to_camera[2, :3].cpu().double()).tolist()
+    azimuth = math.degrees(math.atan2(y, x))
+    elevation = max(-60.0, min(60.0, math.degrees(math.atan2(z, math.hypot(x, y)))))
+    ends = np.array(whole or _whole(simulation, roles))
+    reach = 1.7 * float(np.linalg.norm(np.ptp(ends, axis=0)))  # room for arrows and coordinates
+    flow = mean_flow(simulation).tolist()
+    counts = {name: int(mask.sum()) for name, mask in vars(roles).items() if name != "names"}
+    still = len(roles.simulated) - int((roles.simulated | roles.carried).sum())
+    entries = [
+        (REGION, f"box of the {counts['simulated']:,} simulated Gaussians [scene units]"),
+        (HELD, f"held: {counts['pinned']:,} Gaussians"),
+        (WIND, f"steady wind {wind_words(flow, frame.rotation[2].tolist())}"),
+        (NORMAL, "normals, flipped to the eye"),
+        ((190, 190, 190), f"not simulated: {still:,} Gaussians, greyed"),
+        ((120, 120, 120), f"faint or loose, follow their neighbours: {counts['carried']:,} Gaussians"),
+        *([(PUSHED, f"pushed: {counts['pushed']:,} Gaussians")] if counts["pushed"] else []),
+        *((tint, f"{name}: {int(mask.sum()):,} Gaussians, soft") for name, mask, tint in tints),
+    ]
+    page = Image.new("RGB", (2 * height, height + 12 + 24 * -(-len(entries) // 2)), (255, 255, 255))
+    for k in range(2):
+        turned = azimuth - 90 * k
+        camera = orbit_camera(ends.mean(0).tolist(), frame.rotation[2], reach, turned, elevation, 40.0, height, height)
+        view = _view(simulation, roles, camera, tints)
+        view.draw.text((8, 6), f"azimuth {turned:.0f}°", INK, view.font)
+        page.paste(view.picture, (k * height, 0))
+    draw = ImageDraw.Draw(page)
+    for k, (colour, text) in enumerate(entries):
+        x, y = 14 + k % 2 * height, height + 12 + 24 * (k // 2)
+        draw.rectangle([x, y + 2, x + 16, y + 14], fill=colour)
+        draw.text((x + 26, y), text, INK, view.font)
+    return np.asarray(page)
+
+
+def _view(simulation: Simulation, roles: Roles, camera: Camera, tints: Sequence[tuple[str, Tensor, Colour]]) -> View:
+    scene, rest = simulation.scene, simulation.scene.rest()
+    model = scene.model
+    toward = torch.nn.functional.normalize(camera.position.to(rest.means) - rest.means, dim=-1)
+    colours = roles_tinted(model.colors(-toward).clamp(0, 1), roles, tints)
+    view = View(colours, (rest.means, rest.covariances, model.opacity()), camera)
+    if is_blank(view.pixels):
+        warnings.warn("The preview shows nothing: check that the Gaussians are opaque.", stacklevel=2)
+    means, normals = rest.means.cpu().double(), scene.rest_normals.cpu().double()
+    pixel, depth = project(means, camera)
+    step = camera.height / 26  # one normal for each cell of a lattice over the picture, of the nearest solid Gaussian
+    cell = np.floor(pixel.numpy() / step).astype(int)
+    inside = roles.simulated.numpy() & (depth.numpy() > camera.near) & (cell >= 0).all(1) & (cell < 26).all(1)
+    opaque = inside & (model.opacity().cpu().numpy() >= 0.5)
+    index = np.flatnonzero(opaque if opaque.any() else inside)
+    index = index[depth.numpy()[index].argsort()]
+    index = index[np.unique(cell[index] @ [26, 1], return_index=True)[1]]
+    sides = torch.where((toward.cpu() * normals).sum(-1, keepdim=True) < 0, -normals, normals)
+    ends = torch.stack([means, means + 0.035 * scene.size * sides], 1).numpy()[index]
+    view.lines(ends, INK, 3)
+    view.lines(ends, NORMAL, 1)
+    low, high = (bound.cpu().double().numpy() for bound in scene.bounds)
+    margin = 0.02 * scene.size
+    view.box(low - margin, high + margin, REGION, named=True)
+    for boundary in conditions(simulation):
+        region = getattr(boundary, "region", None)
+        if isinstance(region, Box):
+            first, last = np.maximum(region.min, low - margin), np.minimum(region.max, high + margin)
+            if (first < last).all():
+                view.box(first, last, PUSHED if boundary.held_share is None else HELD)
+    flow = mean_flow(simulation).numpy()
+    if flow.any():
+        along = scene.frame.direction_to_scene(torch.from_numpy(flow / np.linalg.norm(flow))).numpy()
+        across = np.cross(along, np.eye(3)[np.abs(along).argmin()])
+        across /= np.linalg.norm(across)
+        second, half = np.cross(across, along), 0.5 * (high - low)
+        wide, tall, deep = (half @ np.abs(way) for way in (across, second, along))
+        upwind = 0.5 * (low + high) - (deep + 0.06 * scene.size) * along
+        tips = np.array([upwind + a * wide * across + b * tall * second for a, b in TIPS])
+        view.arrows(np.stack([tips - ARROW * scene.size * along, tips], 1), WIND)
+    up = scene.frame.rotation[2].numpy()
+    (a, b) = project(torch.from_numpy(np.stack([0 * up, 0.1 * scene.size * up]) + 0.5 * (low + high)), camera)[0]
+    way = ((b - a) / (b - a).norm().clamp(min=1e-6)).tolist()
+    base = np.array([26.0, camera.height - 18.0])
+    tip = base + 0.09 * camera.height * np.array(way)
+    view.draw.line([tuple(base), tuple(tip)], fill=INK, width=3)
+    view.draw.text((36, camera.height - 36), "up", INK, view.font)
+    return view
+
+
+def roles_tinted(colours: Tensor, roles: Roles, tints: Sequence[tuple[str, Tensor, Colour]] = ()) -> Tensor:
+    """Colours (N, 3) with those of parts and of what is pushed or pinned, and grey where nothing moves."""
+    still = ~(roles.simulated | roles.carried)
+    soft = [(mask, tinted(colours, tint, 0.4)) for _, mask, tint in tints]
+    for mask, shown in [*soft, (still, greyed(colours))]:
+        colours = torch.where(mask.to(colours.device)[:, None], shown, colours)
+    for mask, tint in ((roles.pushed, PUSHED), (roles.pinned, HELD)):
+        colours = torch.where(mask.to(colours.device)[:, None], tinted(colours, tint), colours)
+    return colours
+
+
+@torch.no_grad()
+def things_picture(cloud: GaussianCloud, place: Place, chosen: Sequence[int], device: torch.device) -> Array:
+    """The things of a place, each with its number, on what is around it in grey.
+
+    Args:
+        cloud: The splat.
+        place: Its parts.
+        chosen: Numbers of those that will move; they have a frame.
+        device: Where to draw.
+
+    Returns:
+        8-bit RGB, shape (H, W, 3), up to four in a row.
+    """
+    from PIL import Image
+
+    across, up, means = min(4, len(place.things)), torch.tensor(place.up.direction), cloud.means.numpy()
+    page = Image.new("RGB", (across * THING, -(-len(place.things) // across) * THING), (255, 255, 255))
+    for k, thing in enumerate(place.things):
+        mine, size = np.isin(np.arange(len(cloud)), thing.members), np.subtract(thing.high, thing.low)
+        low, high = thing.low - 0.3 * size.max(), thing.high + 0.3 * size.max()
+        index = np.flatnonzero(((means >= low) & (means <= high)).all(1) & ~place.far)
+        index = index[:: max(1, len(index) // MOST_DRAWN)]
+        part, reach = cloud.select(torch.from_numpy(index)).to(device), 1.5 * float(np.linalg.norm(size))
+        camera = orbit_camera(np.mean([low, high], 0).tolist(), up, reach, 30.0, 20.0, 40.0, THING, THING)
+        colours = Gaussians.of(part.to("cpu")).colour
+        grey = 0.55 + 0.35 * colours.mean(1, keepdims=True)
+        shown = torch.from_numpy(np.where(mine[index, None], colours, grey)).to(device)
+        view = View(shown, (part.means, covariance(part.quats, part.scales), part.opacities.sigmoid()), camera)
+        moves = k + 1 in chosen
+        if moves:
+            view.draw.rectangle((1, 1, THING - 2, THING - 2), outline=REGION, width=3)
+        view.draw.text((10, 6), f"{k + 1}" + ("  moves" if moves else ""), INK, view.font)
+        page.paste(view.picture, (k % across * THING, k // across * THING))
+    return np.asarray(page)
