@@ -76,7 +76,7 @@ from gaussian_swaying.simulation.model import (
     resolve_device,
 )
 from gaussian_swaying.simulation.record import Run
-from gaussian_swaying.simulation.step import SceneEditor, Stepper, copies_of
+from gaussian_swaying.simulation.step import Copies, SceneEditor, Stepper
 from gaussian_swaying.wind.computed_air import ComputedAir
 from gaussian_swaying.wind.field import SpatialWind, WindField
 from gaussian_swaying.wind.force import AeroForce
@@ -239,7 +239,7 @@ class Simulation(Fixed):
         aero = aero or AeroForce()
         model = Model(seen, material, blowing, aero, own, solver.settings, air, float(frame_dt))
         wait_for_device()
-        placed = copies_of(copies, model, solver) if copies else None
+        placed = Copies(copies, model, solver) if copies else None
         self._stepper = Stepper(solver, model, copies=placed)
         drawing = (self._stepper, shader, camera, cameras, colour, renderer)
         self._painter = Painter(*drawing) if placed is None else CopiesPainter(*drawing)
@@ -435,6 +435,21 @@ class Simulation(Fixed):
         other.config = config
         return other
 
+    def batch(self, models: Sequence[Model]) -> Stepper:
+        """Several models of this scene as one, such as ``[model, model.at("wind.speed", 9)]``: in one rollout.
+
+        Args:
+            models: They may differ in wind and material.
+
+        Raises:
+            ValueError: If they cannot be a batch.
+        """
+        why = "they have `copies`, which are one already" if self._stepper.copies is not None else None
+        why = "they have `edits`; put their material into `material`" if self._editor.edits else why
+        if why is not None:
+            raise ValueError(f"These cannot be simulated as a batch: {why}.")
+        return Stepper(self.solver.like(models[0].solver), models, turn=self.turn)
+
     def _running(self) -> dict[str, tuple[object, list[object]]]:
         """What runs now by its names: each with the objects and versions of tensors that change if it does."""
         model, painter = self.model, self._painter
@@ -610,21 +625,6 @@ def _same(before: object, now: object) -> bool:
     return before is now or (isinstance(now, int | float) and before == now)
 
 
-def batch_of(members: Sequence[Simulation]) -> Stepper:
-    """A stepper that advances simulations of one scene together.
-
-    Args:
-        members: A simulation, and variants of it (``Simulation.variant``) that differ in wind and material.
-    """
-    first = members[0]
-    if any(member.stepper.copies is not None for member in members):
-        raise ValueError("These cannot be simulated as a batch: they have `copies`, which are one already.")
-    if any(member.editor.edits for member in members):
-        raise ValueError("These cannot be simulated as a batch: they have `edits`; put their material into `material`.")
-    solver = first.solver.like(first.model.solver)
-    return Stepper(solver, [member.model for member in members], turn=first.turn)
-
-
 @torch.inference_mode()
 def run_batch(
     members: Sequence[Simulation], folders: Sequence[Path | None], frames: int, settings: Sequence[Mapping[str, Any]]
@@ -634,7 +634,7 @@ def run_batch(
     There are no checkpoints: what is interrupted starts again.
 
     Args:
-        members: As for :func:`batch_of`.
+        members: A simulation, and variants of it (``Simulation.variant``) that differ in wind and material.
         folders: Folder of each; None for one that is only simulated.
         frames: Number of frames.
         settings: Further entries of each summary.
@@ -642,7 +642,7 @@ def run_batch(
     Returns:
         The summaries.
     """
-    batch = batch_of(members)
+    batch = members[0].batch([member.model for member in members])
     state = batch.start()
     opened, runs = [], dict[int, Run]()
     try:

@@ -42,7 +42,7 @@ from gaussian_swaying.simulation.measure import (
 from gaussian_swaying.simulation.model import Copy, Edit, Model, edited_points, recolored
 from gaussian_swaying.wind.computed_air import AirInBox
 from gaussian_swaying.wind.field import WindField
-from gaussian_swaying.wind.force import AirLift, Places, Wind, WindForce, carried_mass, with_added_mass
+from gaussian_swaying.wind.force import AirLift, Wind, WindForce, carried_mass, with_added_mass
 from gaussian_swaying.wind.patches import Patches
 from gaussian_swaying.wind.tables import Shelter
 
@@ -51,31 +51,41 @@ RENDERS = ("color", "depth", "normal")
 
 
 class Copies(nn.Module):
-    """The copies of a scene: ``x`` of the object lies at ``A x + b`` in each copy.
+    """The copies of an object: its ``x`` lies at ``A x + b`` in each copy, and each feels the wind there.
 
     Args:
         copies: The copies.
-        scene: The scene.
-        boundaries: The boundaries of the solver; the turns are about what its pins hold.
+        model: The object; turns are about what its pins hold.
+        solver: Its solver.
 
     Attributes:
-        places: Their places in the wind.
         rotation: ``A``, the rotation along the axes of the scene, shape (B, 3, 3), float64.
         offset: ``b`` [scene units], shape (B, 3), float64.
+        turn: Rotations from the axes of the object to those of the wind, shape (B, 3, 3), float64.
+        shift: Displacements after them [m], shape (B, 3), float64.
+        delay: Times by which the wind comes later [s], shape (B,), float64.
     """
 
-    def __init__(self, copies: Sequence[Copy], scene: SimulatedScene, boundaries: Iterable[nn.Module] = ()) -> None:
+    def __init__(self, copies: Sequence[Copy], model: Model, solver: Solver) -> None:
         super().__init__()
-        self.copies, frame = tuple(copies), scene.frame
+        if model.forces:
+            raise ValueError("`copies` cannot have `forces` yet, as these act on one object: remove them.")
+        if any(copy.seed is not None for copy in copies) and not isinstance(model.wind, WindField):
+            raise ValueError("Expected `copies.seed` null with a wind of your own, which has no seed: use `delay`.")
+        if any(copy.turn for copy in copies) and any(solver.gravity[:2]):
+            raise ValueError(
+                "`copies` with a `turn` need `solver.gravity` along z: each is simulated in its own turned axes."
+            )
+        self.copies, frame = tuple(copies), model.scene.frame
         eye, axes = torch.eye(3, dtype=torch.float64), frame.rotation
         turn = torch.stack([_turn(copy.turn) for copy in copies])
         shift = torch.tensor([copy.shift for copy in copies], dtype=torch.float64)
-        shift = shift + (eye - turn) @ _foot(scene, boundaries)
+        shift = shift + (eye - turn) @ _foot(model.scene, solver.boundaries)
         rotation = eye + axes.T @ (turn - eye) @ axes  # exactly I where the copy is not turned
         offset = (eye - rotation) @ frame.origin + shift @ axes / frame.metres_per_unit
         delay = torch.tensor([copy.delay for copy in copies], dtype=torch.float64)
-        self.places = Places(turn, shift, delay)
-        for name, value in {"rotation": rotation, "offset": offset}.items():
+        values = {"rotation": rotation, "offset": offset, "turn": turn, "shift": shift, "delay": delay}
+        for name, value in values.items():
             self.register_buffer(name, value, persistent=False)
         self.rotation: Tensor
         self.offset: Tensor
@@ -103,46 +113,12 @@ class Copies(nn.Module):
         return found
 
 
-def copies_of(copies: Sequence[Copy], model: Model, solver: Solver) -> Copies:
-    """The copies of the object of a simulation.
-
-    Args:
-        copies: The copies.
-        model: Scene, material and drivers of the object.
-        solver: Its solver.
-    """
-    why = _why_not(copies, model, solver)
-    if why is not None:
-        raise ValueError(why)
-    return Copies(copies, model.scene, solver.boundaries)
-
-
-def _why_not(copies: Sequence[Copy], model: Model, solver: Solver) -> str | None:
-    wind = model.wind
-    if model.air is not None:
-        return "`copies` cannot have computed air yet, which belongs to one object: set `air` to null."
-    if model.scene.surface_places is not None:
-        return "`copies` cannot touch anything yet: set `contact` to null, and remove obstacles from the solver."
-    if model.forces:
-        return "`copies` cannot have `forces` yet, as these act on one object: remove them."
-    if isinstance(wind, WindField) and any(isinstance(effect, Shelter) for effect in wind.effects):
-        return "`copies` cannot have a Shelter yet, which belongs to one object: remove it from `wind.effects`."
-    if any(copy.seed is not None for copy in copies) and not isinstance(wind, WindField):
-        return "Expected `copies.seed` null with a wind of your own, which has no seed: use `delay`."
-    if any(copy.turn for copy in copies) and any(solver.gravity[:2]):
-        return "`copies` with a `turn` need `solver.gravity` along z: each is simulated in its own turned axes."
-    return None
-
-
 def check_recorder(recorder: Recorder) -> None:
     """Raise ValueError if a recorder writes what runs with copies do not have."""
-    wrong = [name for name in ("trajectory", "nodes") if getattr(recorder, name)]
+    wrong = [f"`recorder.{name}`" for name in ("trajectory", "nodes") if getattr(recorder, name)]
+    wrong += [f"{render} in `recorder.renders`" for render in recorder.renders if render not in RENDERS]
     if wrong:
-        names = " and ".join(f"`recorder.{name}`" for name in wrong)
-        raise ValueError(f"`copies` are recorded as pictures only: set {names} to false.")
-    wrong = [render for render in recorder.renders if render not in RENDERS]
-    if wrong:
-        raise ValueError(f"`copies` have no pictures of {' and '.join(wrong)} yet: remove it from `recorder.renders`.")
+        raise ValueError(f"`copies` are recorded as pictures only: leave out {', '.join(wrong)}.")
 
 
 def _turn(degrees: float) -> Tensor:
@@ -274,7 +250,7 @@ class Stepper:
             return alone
         wind: Wind | Sequence[Wind] = WindField.together(winds) or winds
         if self.copies is not None:
-            wind, places = self.copies.winds(first.wind), self.copies.places.to(self.device)
+            wind, places = self.copies.winds(first.wind), self.copies.to(self.device)
         if alone.sums is None:
             return WindForce(first.aero, wind, alone.normal, alone.area, places)
         return WindForce(first.aero, wind, _repeated(first.scene.patches, len(winds)), places=places)

@@ -584,24 +584,6 @@ class AirLift(Force):
 Wind = WindField | SpatialWind
 
 
-class Places(nn.Module):
-    """Where copies of an object stand in one wind: each is simulated as if it stood at the place of the original.
-
-    Args:
-        turn: Rotation from the axes of the original to those of the scene, shape (B, 3, 3), float64.
-        shift: Places are turned by it and then moved by this [m], shape (B, 3), float64.
-        delay: Time by which the wind comes later [s], shape (B,), float64.
-    """
-
-    def __init__(self, turn: Tensor, shift: Tensor, delay: Tensor) -> None:
-        super().__init__()
-        for name, value in {"turn": turn, "shift": shift, "delay": delay}.items():
-            self.register_buffer(name, value, persistent=False)
-        self.turn: Tensor
-        self.shift: Tensor
-        self.delay: Tensor
-
-
 class WindForce(Force):
     """Wind on surface patches that deform with their particles.
 
@@ -615,7 +597,9 @@ class WindForce(Force):
         normal: Unit normals of the patches at rest, one for each particle, shape (..., P, 3); or any number of
             :class:`~gaussian_swaying.wind.patches.Patches`, those of the scenes of a batch one after the other.
         area: Their areas at rest [m²], shape (..., P); zero for particles that feel no wind. None with ``Patches``.
-        places: The places of the scenes in one wind that they share.
+        places: Where copies of an object stand in one wind, each simulated as if it stood at the place of the original:
+            a module with ``turn``, the rotations to the axes of the wind, shape (B, 3, 3), ``shift`` [m], shape (B, 3),
+            and ``delay`` of the wind [s], shape (B,).
 
     Attributes:
         normal: Unit normals at rest, shape (..., P, 3).
@@ -639,7 +623,7 @@ class WindForce(Force):
         wind: Wind | Sequence[Wind],
         normal: Tensor | Patches,
         area: Tensor | None = None,
-        places: Places | None = None,
+        places: Any = None,
     ) -> None:
         super().__init__()
         self.sums: PatchSums | None = None

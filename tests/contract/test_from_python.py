@@ -22,7 +22,6 @@ from gaussian_swaying import (
     write_ply,
 )
 from gaussian_swaying.scenes import FlagScene
-from gaussian_swaying.simulation.simulation import batch_of
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "python.md").read_text()
@@ -169,7 +168,7 @@ def test_runs_in_one_rollout_end_as_each_alone(formulation):
     solver = MPMSolver(dx=0.2, formulation=formulation, substep=2e-3, boundaries=pins, transfer="torch")
     first = _flag(hold=None, solver=solver, dtype="float64")
     members = [first, first.variant({"wind.speed": 9.0}), first.variant({"material.E": 2e4, "wind.azimuth": 50.0})]
-    batch = batch_of(members)
+    batch = first.batch([member.model for member in members])
     state = batch.start()
     for _ in range(3):
         state, _ = batch.advance(state)

@@ -16,7 +16,6 @@ from gaussian_swaying.geometry.regions import Sphere
 from gaussian_swaying.mpm.embedded import EmbeddedAtPoints
 from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.simulation.model import Edit
-from gaussian_swaying.simulation.simulation import batch_of
 from gaussian_swaying.viewer.session import Session
 
 BOX = {"min": [None, None, None], "max": [0.11, None, None]}
@@ -90,7 +89,7 @@ def test_edits_and_parameters_reach_it(simulation):
 
 def test_a_batch_moves_as_each_alone(simulation):
     variant = simulation.variant({"wind.speed": 6.0})
-    batch = batch_of([simulation, variant])
+    batch = simulation.batch([simulation.model, variant.model])
     state = batch.start()
     ends = [(member, member.start()) for member in (simulation, variant)]
     for _ in range(2):

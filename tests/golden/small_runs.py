@@ -15,7 +15,6 @@ from gaussian_swaying import Force, GaussianCloud, Simulation, write_ply
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.rendering.torch_renderer import TorchRenderer
 from gaussian_swaying.scenes import FlagScene
-from gaussian_swaying.simulation.simulation import batch_of
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 SPACING, SPARSE = "scene.generator.init_args.spacing", "scene.generator.init_args.leaves"
@@ -251,7 +250,8 @@ def simulation_of(name, folder, **arithmetic):
 
 def frames_of_batch(simulation):
     """Places and squared stretches of the points of three runs in one rollout, the first of them as it is."""
-    batch = batch_of([simulation, simulation.variant({"wind.speed": 9.0}), simulation.variant({"material.E": 2e4})])
+    model = simulation.model
+    batch = simulation.batch([model, model.at("wind.speed", 9.0), model.at("material.E", 2e4)])
     state = batch.start()
     while True:
         state, health = batch.advance(state)

@@ -10,7 +10,6 @@ from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.simulation.body import Material
 from gaussian_swaying.simulation.model import Edit
-from gaussian_swaying.simulation.simulation import batch_of
 from gaussian_swaying.wind.field import WindField
 from gaussian_swaying.wind.force import AeroForce, added_mass_per_area
 
@@ -116,7 +115,7 @@ def test_a_batch_is_as_each_alone(hanging):
     """Of two densities, in other winds."""
     first = hanging(air(drag=0.5), wind=WindField([1.0, 4.0, 0.0]), substep=0.004)
     other = first.variant({"material.density": 50.0, "wind.speed": 2.0})
-    batch = batch_of([first, other])
+    batch = first.batch([first.model, other.model])
     state = batch.start()
     for _ in range(3):
         state, health = batch.advance(state)

@@ -12,7 +12,7 @@ from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
 from gaussian_swaying.simulation.body import Material, Scene
 from gaussian_swaying.simulation.model import Edit
-from gaussian_swaying.simulation.simulation import Simulation, batch_of
+from gaussian_swaying.simulation.simulation import Simulation
 
 DX = 0.1
 
@@ -72,7 +72,7 @@ def test_a_batch_has_joints_as_soft_as_its_lightest_scene_needs():
     light = heavy.variant({"material.density": 5.0})
     alone = light.stepper.joints[0]
     for members in ([heavy, light], [light, heavy]):
-        joints = batch_of(members).joints[0]
+        joints = members[0].batch([member.model for member in members]).joints[0]
         for name in ("stiffness", "turning"):
             torch.testing.assert_close(getattr(joints, name), getattr(alone, name))
 

@@ -10,7 +10,7 @@ import torch
 from shared import advanced
 
 from gaussian_swaying.cli.sweep import main
-from gaussian_swaying.simulation.simulation import Simulation, batch_of
+from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.plan import make_plan, read_sweep
 from gaussian_swaying.sweeps.run import Job, members_of
 
@@ -23,7 +23,7 @@ def _batch(tmp_path, file):
     plan = make_plan(read_sweep(file))
     job = Job(tmp_path, tuple(plan.names), plan.config, plan.frames, tuple(plan.runs), "cuda")
     members, _ = members_of(job, Simulation.parser())
-    return batch_of(members), members
+    return members[0].batch([member.model for member in members]), members
 
 
 def test_together_is_as_alone(tmp_path, sweep_file):

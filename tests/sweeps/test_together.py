@@ -9,7 +9,7 @@ import torch
 from gaussian_swaying.cli.sweep import main
 from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.simulation.model import in_settings
-from gaussian_swaying.simulation.simulation import Simulation, batch_of
+from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep
 from gaussian_swaying.sweeps.run import Job, grouped, members_of, texts
 
@@ -61,7 +61,8 @@ def test_together_as_alone(tmp_path, sweep_file):
 def test_the_state_of_a_scene(tmp_path, sweep_file):
     plan = make_plan(read_sweep(sweep_file(tmp_path / "tiny.yaml", settings=FIXED)))
     job = Job(tmp_path, tuple(plan.names), plan.config, plan.frames, tuple(plan.runs), "cpu")
-    together = batch_of(members_of(job, Simulation.parser())[0])
+    members = members_of(job, Simulation.parser())[0]
+    together = members[0].batch([member.model for member in members])
     state = together.start()
     assert state.position.shape[0] == 8
     frame = together.launch(state)

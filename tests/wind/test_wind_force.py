@@ -3,6 +3,7 @@
 import math
 import tempfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +18,6 @@ from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.mpm.device_functions import Packed
 from gaussian_swaying.wind.effects import CylinderObstacle, EllipsoidObstacle, LogProfile, Plume, PowerProfile
 from gaussian_swaying.wind.field import FlowKey
-from gaussian_swaying.wind.force import Places
 from gaussian_swaying.wind.patches import Patches
 from gaussian_swaying.wind.tables import CarriedField, RecordedWind, Shelter
 from gaussian_swaying.wind.turbulence import Turbulence
@@ -156,7 +156,8 @@ class Whirl(SpatialWind):
 
 def _blown(winds, turn, shift, delay):
     """The wind at five points of two copies, and its force."""
-    places = Places(torch.stack([_turn(0.0), turn]), double([[0.0] * 3, shift]), double([0.0, delay]))
+    turns = torch.stack([_turn(0.0), turn])
+    places = SimpleNamespace(turn=turns, shift=double([[0.0] * 3, shift]), delay=double([0.0, delay]))
     load = WindForce(AeroForce(), winds, torch.eye(3, dtype=torch.float64)[2:].expand(5, 3), torch.ones(5), places)
     return load, torch.rand(2, 5, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
 
