@@ -126,7 +126,7 @@ def test_forces_in_torch_among_the_kernels(kernel_device, formulation, case, mon
     seen = []
 
     def run(solver, state):
-        monkeypatch.setattr(solver, "_step", None if solver.transfer == "kernels" else solver._step)
+        monkeypatch.setattr(solver, "_one_by_one", None if solver.transfer == "kernels" else solver._one_by_one)
         forces = FORCES[name](points, pull)
         states = [solver.rollout(state, DT, 1, forces)]
         state, cells = solver.watched_rollout(states[-1], 0.7 * DT, 4, forces, 2)
