@@ -10,11 +10,11 @@ from pathlib import Path
 import torch
 
 from gaussian_swaying import AeroForce, Material, MPMSolver, OrbitCamera, Simulation
+from gaussian_swaying.gaussians.measures import Gaussians
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.scenes.ficus import FicusScene
 from gaussian_swaying.scenes.procedural import GivenScene
 from gaussian_swaying.simulation.body import Scene
-from gaussian_swaying.suggestion.measures import Gaussians
 
 
 def main(folder: Path, frames: int = 50, spacing: float = 0.03, dx: float = 0.08) -> dict[str, float]:

@@ -131,7 +131,7 @@ def first_cameras(
 ) -> list[Camera]:
     """Cameras around a splat, from which it fills the picture."""
     from gaussian_swaying.fitting.registration import cameras_around
-    from gaussian_swaying.suggestion.measures import Gaussians
+    from gaussian_swaying.gaussians.measures import Gaussians
     from gaussian_swaying.suggestion.up import guess_up
 
     splat, draw = Gaussians.of(cloud), torch.Generator().manual_seed(0)

@@ -22,10 +22,10 @@ from gaussian_swaying.fitting.held import held_end, moving_box, moving_points
 from gaussian_swaying.fitting.scale import SCALE
 from gaussian_swaying.fitting.videos import Footage, read_videos
 from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.hold import given_hold
+from gaussian_swaying.gaussians.measures import DIRECTIONS
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.protocol import RenderOutput
-from gaussian_swaying.suggestion.hold import given_hold
-from gaussian_swaying.suggestion.measures import DIRECTIONS
 from gaussian_swaying.suggestion.suggest import suggest
 from gaussian_swaying.suggestion.suggestion import Suggestion
 

@@ -17,6 +17,7 @@ from gaussian_swaying.cli.errors import guessing, parser_sentence, run_command
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.config.material_names import NAMES
 from gaussian_swaying.gaussians.formats import read_gaussians
+from gaussian_swaying.gaussians.measures import DIRECTIONS
 from gaussian_swaying.gaussians.parts import Parts
 from gaussian_swaying.gaussians.repair import OPAQUE_LOGIT
 from gaussian_swaying.geometry.origin import counted_from
@@ -24,7 +25,6 @@ from gaussian_swaying.simulation.measure import duration
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.suggestion.cost import Cost, Stopwatch, estimate_cost
 from gaussian_swaying.suggestion.kinds import KINDS
-from gaussian_swaying.suggestion.measures import DIRECTIONS
 from gaussian_swaying.suggestion.picture import preview_picture
 from gaussian_swaying.suggestion.suggest import QUALITIES, suggest
 from gaussian_swaying.suggestion.suggestion import (

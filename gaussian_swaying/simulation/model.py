@@ -30,6 +30,8 @@ from gaussian_swaying._numbers import sense_of
 from gaussian_swaying.captures.capture_camera import CaptureCamera, photo_azimuth, read_views
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.harmonics import SH_DC
+from gaussian_swaying.gaussians.hold import end_region, guess_hold
+from gaussian_swaying.gaussians.measures import Gaussians
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.neighbours import particle_spacing
 from gaussian_swaying.geometry.regions import Region, RegionInFrame
@@ -688,7 +690,7 @@ else:  # what a YAML file can contain: the annotations of the constructor are it
     SceneLike, WindLike, DeviceLike = Scene, WindField, Literal["auto", "cpu", "cuda"]
     SolverLike, MaterialLike = MPMSolver, Material
 
-HoldLike = Region | PinnedRegion | PinnedPoints | list[Region | PinnedRegion | PinnedPoints]
+HoldLike = Region | PinnedRegion | PinnedPoints | list[Region | PinnedRegion | PinnedPoints] | str
 CELLS = 32
 """Largest number of grid cells along the longest side if no solver is given."""
 
@@ -743,15 +745,20 @@ def as_solver(
     captured shape is already in balance with its weight. ``damping`` [1/s] is that of a solver that is made.
     """
     if solver is None:
-        given = list(hold) if isinstance(hold, list | tuple) else [] if hold is None else [hold]
-        pins = [PinnedRegion(part) if isinstance(part, Region) else part for part in given]
-        means = cloud.means[scene.select(cloud)]
+        own = cloud.select(scene.select(cloud))
+        means = own.means
         frame = SimFrame.fit(means, scene.up, scene.longest_side, scene.metres_per_unit)
         side = float((means.amax(0) - means.amin(0)).amax()) * frame.metres_per_unit
-        spacing = particle_spacing(means) * frame.metres_per_unit
+        dx = suggest_spacing(side, particle_spacing(means) * frame.metres_per_unit, CELLS)
+        if isinstance(hold, str):
+            check_choice("hold", hold, ("auto",))
+            splat, cell = Gaussians.of(own), dx / frame.metres_per_unit
+            hold = end_region(splat.means, guess_hold(splat, frame.rotation[2].tolist(), cell).direction, cell)
+        given = list(hold) if isinstance(hold, list | tuple) else [] if hold is None else [hold]
+        pins = [PinnedRegion(part) if isinstance(part, Region) else part for part in given]
         held = bool(pins) or (scene.parts is not None and bool(scene.parts.mask(role="held").any()))
         gravity = (0.0, 0.0, 0.0 if held else -9.8)
-        return MPMSolver(dx=suggest_spacing(side, spacing, CELLS), gravity=gravity, boundaries=pins, damping=damping)
+        return MPMSolver(dx=dx, gravity=gravity, boundaries=pins, damping=damping)
     if hold is not None:
         raise ValueError(
             "`hold` only works without a solver: add the pin to the `boundaries` of the solver, and leave out `hold`."
@@ -829,6 +836,6 @@ _KINDS: dict[str, tuple[type, ...]] = {
     "copies": (list, tuple),
     "recorder": (Recorder,),
     "normalisation": (Normalisation,),
-    "hold": (Region, PinnedRegion, PinnedPoints, list, tuple),
+    "hold": (Region, PinnedRegion, PinnedPoints, list, tuple, str),
 }
 _LISTS = {"forces": (Force,), "edits": (Edit,), "copies": (Copy,), "hold": (Region, PinnedRegion, PinnedPoints)}

@@ -156,7 +156,8 @@ class Simulation(Fixed):
         device: auto uses a CUDA GPU if there is one, else the CPU.
         up: Python only, if ``scene`` is not a :class:`Scene`: direction in the scene that points up.
         hold: Python only, if no solver is given: what is held in place. A region, or a pin with a kind of its own:
-            ``PinnedRegion(region, kind="clamp")`` also holds the slope, ``PinnedPoints`` holds given places; or a list.
+            ``PinnedRegion(region, kind="clamp")`` also holds the slope, ``PinnedPoints`` holds given places. Or
+            a list of them, or ``auto`` for the end at which it seems to be held.
         renderer: Python only: draws the Gaussians; by default gsplat on CUDA and the torch renderer elsewhere.
         cloud: Python only: the Gaussians of ``scene.ply`` if they have been read already, or a part of them.
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gaussian_swaying.gaussians.measures import Array, Gaussians, breadth, corners, extent, slices_of
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.mpm.materials import known_material
-from gaussian_swaying.suggestion.measures import Array, Gaussians, breadth, corners, extent, slices_of
 from gaussian_swaying.suggestion.parts import FoundParts
 
 

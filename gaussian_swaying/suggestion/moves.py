@@ -13,13 +13,8 @@ import torch
 from gaussian_swaying.captures.agreement import places_in_picture
 from gaussian_swaying.captures.capture import common_focus, view_reach
 from gaussian_swaying.captures.capture_camera import read_views
-from gaussian_swaying.geometry.groups import equal_rows
-from gaussian_swaying.geometry.neighbours import particle_spacing
-from gaussian_swaying.geometry.origin import NO_ORIGIN, Origin
-from gaussian_swaying.geometry.regions import Box, Cylinder, Not, Region, Union
-from gaussian_swaying.rendering.cameras.camera import Camera
-from gaussian_swaying.suggestion.hold import AROUND, columns, slab
-from gaussian_swaying.suggestion.measures import (
+from gaussian_swaying.gaussians.hold import AROUND, columns, slab
+from gaussian_swaying.gaussians.measures import (
     DIRECTIONS,
     FEWEST,
     Array,
@@ -37,6 +32,11 @@ from gaussian_swaying.suggestion.measures import (
     sheet_normal,
     snapped,
 )
+from gaussian_swaying.geometry.groups import equal_rows
+from gaussian_swaying.geometry.neighbours import particle_spacing
+from gaussian_swaying.geometry.origin import NO_ORIGIN, Origin
+from gaussian_swaying.geometry.regions import Box, Cylinder, Not, Region, Union
+from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.suggestion.up import CONVENTION, camera_words
 
 THRESHOLDS = (0.1, 0.05, 0.02, 0.01, 0.0)  # of opacity; the first is the paper's

@@ -19,6 +19,8 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._fixed import changed
+from gaussian_swaying.gaussians.hold import columns
+from gaussian_swaying.gaussians.measures import Array, extent, quantile
 from gaussian_swaying.mpm.modal import SHIFT, Structure, analysis_of, factor, rayleigh
 from gaussian_swaying.mpm.modes import MOST_MODES, Modes
 from gaussian_swaying.mpm.solver import MPMSolver
@@ -26,9 +28,7 @@ from gaussian_swaying.mpm.state import State
 from gaussian_swaying.mpm.total import Total
 from gaussian_swaying.simulation.body import SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.suggestion.hold import columns
 from gaussian_swaying.suggestion.kinds import KINDS, Kind
-from gaussian_swaying.suggestion.measures import Array, extent, quantile
 from gaussian_swaying.suggestion.stretch import cloth_motion, linear_motion, rate_for, typical_start
 from gaussian_swaying.wind.field import WindField
 from gaussian_swaying.wind.force import AeroForce, WindForce, added_mass_per_area

@@ -8,11 +8,8 @@ from itertools import groupby
 import numpy as np
 import torch
 
-from gaussian_swaying.gaussians.parts import Part, Parts
-from gaussian_swaying.geometry.groups import equal_rows
-from gaussian_swaying.geometry.regions import Region
-from gaussian_swaying.suggestion.hold import cord_heights
-from gaussian_swaying.suggestion.measures import (
+from gaussian_swaying.gaussians.hold import cord_heights
+from gaussian_swaying.gaussians.measures import (
     FEWEST,
     Array,
     Gaussians,
@@ -24,6 +21,9 @@ from gaussian_swaying.suggestion.measures import (
     sheet_normal,
     slices_of,
 )
+from gaussian_swaying.gaussians.parts import Part, Parts
+from gaussian_swaying.geometry.groups import equal_rows
+from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.suggestion.moves import contains
 
 SLICES, SECTORS = 40, 16  # of the height; of a slice

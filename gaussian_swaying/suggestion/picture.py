@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gaussian_swaying._files import is_blank
 from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.measures import Array, Gaussians, corners, pieces
 from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.rendering.cameras.camera import Camera, orbit_camera, project
@@ -19,7 +20,6 @@ from gaussian_swaying.rendering.gsplat_renderer import make_renderer
 from gaussian_swaying.rendering.thinning import DETAIL
 from gaussian_swaying.rendering.tints import HELD, greyed, tinted
 from gaussian_swaying.simulation.simulation import Roles, Simulation, classify, conditions
-from gaussian_swaying.suggestion.measures import Array, Gaussians, corners, pieces
 from gaussian_swaying.suggestion.moves import Place, nearby
 from gaussian_swaying.suggestion.up import floor_mask, wind_words
 

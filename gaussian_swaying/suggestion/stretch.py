@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from gaussian_swaying.gaussians.measures import Array
 from gaussian_swaying.mpm.modes import Modes
-from gaussian_swaying.suggestion.measures import Array
 from gaussian_swaying.wind.field import WindField
 from gaussian_swaying.wind.force import WindForce
 

@@ -21,6 +21,8 @@ from gaussian_swaying.captures.capture_camera import photo_azimuth
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.connectivity import pieces
 from gaussian_swaying.gaussians.formats import read_gaussians
+from gaussian_swaying.gaussians.hold import PIN_DEPTH, end_region, given_hold, guess_hold
+from gaussian_swaying.gaussians.measures import FEWEST, Array, Gaussians, Guess, corners, sheet_normal
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.geometry.groups import equal_rows, joined
 from gaussian_swaying.geometry.neighbours import particle_spacing
@@ -29,9 +31,7 @@ from gaussian_swaying.mpm.materials import known_material
 from gaussian_swaying.mpm.modes import MOST_LEAN
 from gaussian_swaying.simulation.body import SimulatedScene, suggest_spacing
 from gaussian_swaying.simulation.simulation import classify
-from gaussian_swaying.suggestion.hold import PIN_DEPTH, end_region, given_hold, guess_hold
 from gaussian_swaying.suggestion.kinds import KINDS, kind_of, with_materials
-from gaussian_swaying.suggestion.measures import FEWEST, Array, Gaussians, Guess, corners, sheet_normal
 from gaussian_swaying.suggestion.moves import (
     Photos,
     given_region,

@@ -16,6 +16,8 @@ import torch
 from gaussian_swaying import _program as program
 from gaussian_swaying.config.parser import parse_text
 from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.hold import hold_option
+from gaussian_swaying.gaussians.measures import Array, Guess
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.regions import Box, Cylinder, Not, Region, Union
 from gaussian_swaying.mpm.materials import known_material
@@ -24,9 +26,7 @@ from gaussian_swaying.simulation.measure import duration
 from gaussian_swaying.simulation.model import Model
 from gaussian_swaying.simulation.simulation import Simulation, classify, conditions
 from gaussian_swaying.suggestion.cost import Cost
-from gaussian_swaying.suggestion.hold import hold_option
 from gaussian_swaying.suggestion.kinds import KINDS
-from gaussian_swaying.suggestion.measures import Array, Guess
 from gaussian_swaying.suggestion.moves import Moving, Place
 from gaussian_swaying.suggestion.natural import Natural
 from gaussian_swaying.suggestion.parts import FoundParts

@@ -9,9 +9,8 @@ import numpy as np
 import torch
 
 from gaussian_swaying._checks import check_vector
-from gaussian_swaying.geometry.rotations import rotation_from_z
-from gaussian_swaying.suggestion.hold import balanced_base
-from gaussian_swaying.suggestion.measures import (
+from gaussian_swaying.gaussians.hold import balanced_base
+from gaussian_swaying.gaussians.measures import (
     DIRECTIONS,
     FEWEST,
     Array,
@@ -23,6 +22,7 @@ from gaussian_swaying.suggestion.measures import (
     ranked,
     sheet_normal,
 )
+from gaussian_swaying.geometry.rotations import rotation_from_z
 
 CONVENTION = {"+z": 0.75, "-y": 0.75, "+y": 0.5, "-z": -1.0, "+x": -1.0, "-x": -1.0}
 """Points of each direction, by what capturing and modelling programs write."""

@@ -623,7 +623,7 @@ class WindForce(Force):
         wind: Wind | Sequence[Wind],
         normal: Tensor | Patches,
         area: Tensor | None = None,
-        places: Any = None,
+        places: nn.Module | None = None,
     ) -> None:
         super().__init__()
         self.sums: PatchSums | None = None
@@ -637,7 +637,7 @@ class WindForce(Force):
         check_shape("normal", normal, "P", 3)
         check_shape("area", area, normal.shape[-2])
         self._fields = nn.ModuleList([wind] if isinstance(wind, nn.Module) else wind)
-        self.places = places
+        self.places: Any = places
         several = None if places is None else len(places.delay)
         scenes = several or (wind.scenes if isinstance(wind, WindField) else None)
         scenes = scenes if isinstance(wind, nn.Module) else len(wind)

@@ -123,6 +123,10 @@ def test_several_pins():
     assert float(moved[(x == x.min()) | (x == x.max())].max()) < 0.05 * float(moved.max())
     with pytest.raises(TypeError, match="`hold` to be a list of Region or PinnedRegion or PinnedPoints"):
         _flag(hold=[POLE, "foot"])
+    (guessed,) = _flag(hold="auto").solver.boundaries
+    assert repr(guessed.region) == repr(_flag().solver.boundaries[0].region).replace("0.11", "0.35")  # 1.5 cells
+    with pytest.raises(ValueError, match="`hold` to be one of auto"):
+        _flag(hold="foot")
     with pytest.warns(UserWarning, match="Nothing holds the object.*so it falls"):
         next(_flag(hold=None).frames(1))
 

@@ -28,6 +28,7 @@ from things import (
 )
 
 from gaussian_swaying.gaussians.cloud import joined
+from gaussian_swaying.gaussians.measures import Gaussians
 from gaussian_swaying.mpm.materials import MATERIALS
 from gaussian_swaying.scenes.alocasia import AlocasiaScene
 from gaussian_swaying.scenes.ficus import FicusScene
@@ -38,7 +39,6 @@ from gaussian_swaying.scenes.telephone import TelephoneScene
 from gaussian_swaying.scenes.vase import VaseScene
 from gaussian_swaying.suggestion import parts as finders
 from gaussian_swaying.suggestion.kinds import KINDS, STEM_E
-from gaussian_swaying.suggestion.measures import Gaussians
 from gaussian_swaying.suggestion.suggest import guess
 
 

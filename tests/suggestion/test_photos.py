@@ -10,8 +10,8 @@ from small_scenes import plain_cloud
 from things import full
 
 from gaussian_swaying.captures.capture_camera import photo_azimuth
+from gaussian_swaying.gaussians.measures import Gaussians
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
-from gaussian_swaying.suggestion.measures import Gaussians
 from gaussian_swaying.suggestion.moves import backdrops, cameras_up, read_photos, seen_share, shown_object
 from gaussian_swaying.suggestion.suggest import guess
 

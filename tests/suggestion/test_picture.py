@@ -9,6 +9,7 @@ import yaml
 from small_scenes import plain_cloud, started, together
 
 from gaussian_swaying.config.parser import parse_text
+from gaussian_swaying.gaussians.measures import Gaussians
 from gaussian_swaying.geometry.regions import Box, Cylinder, Everything, Not, Union
 from gaussian_swaying.mpm.colliders import Plane
 from gaussian_swaying.mpm.materials import MATERIALS
@@ -20,7 +21,6 @@ from gaussian_swaying.rendering.torch_renderer import render_torch
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.simulation import Roles, Simulation, classify
 from gaussian_swaying.suggestion.kinds import KINDS
-from gaussian_swaying.suggestion.measures import Gaussians
 from gaussian_swaying.suggestion.picture import (
     PUSHED,
     RADIUS,

@@ -10,12 +10,12 @@ from shared import unit
 from small_scenes import plain_cloud, together, turned_cloud
 
 from gaussian_swaying import suggest
+from gaussian_swaying.gaussians.measures import Gaussians
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.scenes.alocasia import AlocasiaScene
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.suggestion.measures import Gaussians
 from gaussian_swaying.suggestion.moves import move_things, survey
 from gaussian_swaying.suggestion.suggest import guess
 from gaussian_swaying.suggestion.up import given_up

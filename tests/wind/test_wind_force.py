@@ -3,7 +3,6 @@
 import math
 import tempfile
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -157,7 +156,8 @@ class Whirl(SpatialWind):
 def _blown(winds, turn, shift, delay):
     """The wind at five points of two copies, and its force."""
     turns = torch.stack([_turn(0.0), turn])
-    places = SimpleNamespace(turn=turns, shift=double([[0.0] * 3, shift]), delay=double([0.0, delay]))
+    places = torch.nn.Module()
+    vars(places).update(turn=turns, shift=double([[0.0] * 3, shift]), delay=double([0.0, delay]))
     load = WindForce(AeroForce(), winds, torch.eye(3, dtype=torch.float64)[2:].expand(5, 3), torch.ones(5), places)
     return load, torch.rand(2, 5, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
 

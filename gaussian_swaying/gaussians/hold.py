@@ -8,8 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gaussian_swaying._checks import check_choice
-from gaussian_swaying.geometry.regions import Box, Cylinder, Region
-from gaussian_swaying.suggestion.measures import (
+from gaussian_swaying.gaussians.measures import (
     DIRECTIONS,
     FEWEST,
     Array,
@@ -25,6 +24,7 @@ from gaussian_swaying.suggestion.measures import (
     snapped,
     width,
 )
+from gaussian_swaying.geometry.regions import Box, Cylinder, Region
 
 PIN_DEPTH = 0.06  # depth of the pinned end, as a share of the object's length in that direction
 ENDS = {"bottom": "lower", "top": "upper"}
