@@ -638,7 +638,7 @@ class WindForce(Force):
         check_shape("area", area, normal.shape[-2])
         self._fields = nn.ModuleList([wind] if isinstance(wind, nn.Module) else wind)
         self.places: Any = places
-        several = None if places is None else len(places.delay)
+        several = None if places is None else len(self.places.delay)
         scenes = several or (wind.scenes if isinstance(wind, WindField) else None)
         scenes = scenes if isinstance(wind, nn.Module) else len(wind)
         if patches is not None and scenes and len(area) % scenes == 0:
