@@ -637,7 +637,8 @@ class WindForce(Force):
         check_shape("normal", normal, "P", 3)
         check_shape("area", area, normal.shape[-2])
         self._fields = nn.ModuleList([wind] if isinstance(wind, nn.Module) else wind)
-        self.places: Any = places
+        self.places: Any
+        self.places = places
         several = None if places is None else len(self.places.delay)
         scenes = several or (wind.scenes if isinstance(wind, WindField) else None)
         scenes = scenes if isinstance(wind, nn.Module) else len(wind)
