@@ -5,6 +5,7 @@ import multiprocessing
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
 from shared import SMALL
 
@@ -40,8 +41,8 @@ def sweep_file():
 
 @pytest.fixture(scope="session")
 def _workers():
-    """Workers that have imported everything: forks of one process."""
-    if "forkserver" not in multiprocessing.get_all_start_methods():
+    """Workers that have imported everything: forks of one process, which has not asked for a GPU."""
+    if torch.cuda.is_available() or "forkserver" not in multiprocessing.get_all_start_methods():
         yield
         return
     server = multiprocessing.get_context("forkserver")
