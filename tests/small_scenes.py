@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -121,6 +122,10 @@ def previewed(cloud, folder, **options):
     """The suggestion for a splat with z up, and the simulation of its configuration."""
     found = suggest(cloud, **{"up": "+z", "device": "cpu", "quality": "draft", **options})
     return found, started(found, cloud, folder, 250)
+
+
+guess = partial(suggest, tune=False)
+"""All but the numbers with which a thing sways, which takes seconds."""
 
 
 def varied_cloud(count=300, degree=1, seed=0, normals=False):

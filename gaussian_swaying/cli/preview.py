@@ -8,7 +8,7 @@ import sys
 import time
 from argparse import ArgumentError
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +31,10 @@ from gaussian_swaying.suggestion.suggestion import (
     FRAME_DT,
     PICTURE,
     Suggestion,
+    as_plain,
     configuration,
     cost_lines,
     run_lines,
-    suggestion_dict,
     things_lines,
 )
 from gaussian_swaying.wind.turbulence import LOOKS
@@ -108,9 +108,9 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> list[str]:
     things = found.things()
     if things is not None:
         iio.imwrite(folder / "things.png", things)
-    data = {"splat": str(options.scene), "suggestion": suggestion_dict(found), "cost": cost_dict(cost)}
-    (folder / "preview.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
-    names += ["preview.png", "preview.json", *(["things.png"] if things is not None else [])]
+    told = {name: value for name, value in vars(found).items() if name not in ("cloud", "simulation")}
+    _write_numbers(folder, cost, splat=str(options.scene), suggestion=told)
+    names = ["preview.json", "preview.png", *(["things.png"] if things is not None else []), *names]
     degree = "only constant colours were read" if _large(Path(options.scene)) else f"SH degree {cloud.sh_degree}"
     infinite = int((cloud.opacities.abs() == OPAQUE_LOGIT).sum())
     lines = [f"{options.scene}: {len(cloud):,} Gaussians{f', {degree}' if options.verbose else ''}"]
@@ -153,7 +153,7 @@ def preview_config(options: argparse.Namespace, folder: Path) -> list[str]:
     picture = preview_picture(simulation, options.height)
     folder.mkdir(parents=True, exist_ok=True)
     iio.imwrite(folder / "preview.png", picture)
-    (folder / "preview.json").write_text(json.dumps({"cost": cost_dict(cost)}, indent=1) + "\n", encoding="utf-8")
+    _write_numbers(folder, cost)
     return [*run_lines(simulation), *cost_lines(cost), _wrote(folder, ["preview.png", "preview.json"], options.verbose)]
 
 
@@ -161,9 +161,10 @@ def _wrote(folder: Path, names: Sequence[str], verbose: bool) -> str:
     return f"wrote {', '.join(str(folder / name) for name in names)}" + ("" if verbose else "; --verbose says more")
 
 
-def cost_dict(cost: Cost) -> dict[str, Any]:
-    """A cost with its total."""
-    return asdict(cost) | {"total_seconds": cost.total_seconds}
+def _write_numbers(folder: Path, cost: Cost, **more: Any) -> None:
+    told = more | {"cost": vars(cost) | {"total_seconds": cost.total_seconds}}
+    text = json.dumps(told, indent=1, default=as_plain)
+    (folder / "preview.json").write_text(text + "\n", encoding="utf-8")
 
 
 def write_starter(found: Suggestion, folder: Path, frames: int) -> list[str]:
@@ -175,7 +176,7 @@ def write_starter(found: Suggestion, folder: Path, frames: int) -> list[str]:
     if found.parts is not None and parts.exists() and not _same(parts, found.parts.parts):
         _rename(parts)
     found.to_yaml(folder / "starter.yaml", frames)
-    return ["starter.yaml", *(["parts.npz"] if found.parts is not None else [])]
+    return [*(["parts.npz"] if found.parts is not None else []), "starter.yaml"]
 
 
 def _same(file: Path, parts: Parts) -> bool:

@@ -13,6 +13,7 @@ from gaussian_swaying.gaussians.measures import (
     FEWEST,
     Array,
     Gaussians,
+    Guess,
     breadth,
     corners,
     pieces,
@@ -60,6 +61,8 @@ POT_LABEL, SOIL, STEM, LEAF, OTHER = range(5)
 AROUND = "surroundings"
 Labels = tuple[Array, list[Part], str]
 """The label of each Gaussian of an object, the parts by label, and what was found, in words."""
+Support = tuple[Labels, Guess]
+"""Parts that tell where the object is held."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +151,7 @@ class _Pot:
         return np.linalg.norm(across - centre, axis=1) / np.interp(height, self.heights, self.radii)
 
 
-def potted_plant(own: Gaussians, up: Array) -> Labels | None:
+def potted_plant(own: Gaussians, up: Array) -> Support | None:
     """Pot, soil, stems and leaves of a plant that stands in a pot.
 
     A pot is round about the up axis, at the lower end, and not green. It ends where the round wall ends, and most of
@@ -194,7 +197,8 @@ def potted_plant(own: Gaussians, up: Array) -> Labels | None:
     inside = "no soil is seen in it" if level is None else f"with soil at {level:.2f}"
     reason = f"a round wall up to {pot.rim:.2f} of the height, {inside}, and green above"
     parts = [Part("pot", "held" if level is None else "still"), Part("soil", "held"), Part("stem"), Part("leaf")]
-    return label, parts, reason
+    held = Guess("bottom", tuple((0.0 - up).tolist()), "medium", (f"a plant in a pot: {reason}",))
+    return (label, parts, reason), held
 
 
 def _find_pot(across: Array, height: Array, weight: Array, green: Array) -> _Pot | None:
@@ -343,11 +347,10 @@ def _along_sheet(means: Array, up: Array) -> Array | None:
     return aside / np.linalg.norm(aside)
 
 
-def flag_on_pole(own: Gaussians, up: Array) -> tuple[Labels, tuple[float, ...]] | None:
+def flag_on_pole(own: Gaussians, up: Array) -> Support | None:
     """Find the pole of a flag: a slim upright part that is seen alone below or above a cloth, which is on one side.
 
-    Returns:
-        A soft cloth and a still pole, and the unit vector from the cloth to its pole; None if it is not such a flag.
+    The pole is still, and the cloth is held at the side of the pole.
     """
     aside = _along_sheet(own.means, up)
     if aside is None:
@@ -379,10 +382,12 @@ def flag_on_pole(own: Gaussians, up: Array) -> tuple[Labels, tuple[float, ...]] 
         return None
     alone = len(slim) / SLICES
     reason = f"a slim upright pole, alone over {alone:.2f} of its height, with a sheet on one side of it"
-    return ((~cloth).astype(int), [Part("cloth"), Part("pole", "still")], reason), tuple((-toward * aside).tolist())
+    parts, toward_pole = [Part("cloth"), Part("pole", "still")], tuple((-toward * aside).tolist())
+    held = Guess("side", toward_pole, "high", (f"a flag on its pole: {reason}",))
+    return ((~cloth).astype(int), parts, reason), held
 
 
-def washing_line(own: Gaussians, up: Array) -> Labels | None:
+def washing_line(own: Gaussians, up: Array) -> Support | None:
     """Find the posts of a washing line: slim columns from below the hem of an upright sheet to above it.
 
     Posts with their feet and arms are still, line and cloth are soft; None without two posts.
@@ -410,7 +415,8 @@ def washing_line(own: Gaussians, up: Array) -> Labels | None:
         return None
     label = post | (near & ((height < hem) | (height > line)))
     reason = f"a sheet that ends above the ground between {len(runs)} slim posts"
-    return label.astype(int), [Part("cloth"), Part("post", "still")], reason
+    held = Guess("top", tuple(up.tolist()), "high", (f"on a line: {reason}",))
+    return (label.astype(int), [Part("cloth"), Part("post", "still")], reason), held
 
 
 def swinging(own: Gaussians, up: Array, hook: Region, cell: float) -> Labels:

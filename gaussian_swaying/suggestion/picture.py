@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from gaussian_swaying._files import is_blank
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.measures import Array, Gaussians, corners, pieces
+from gaussian_swaying.gaussians.measures import Array, Gaussians, corners, pieces, plane_axes
 from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.rendering.cameras.camera import Camera, orbit_camera, project
@@ -29,6 +30,7 @@ NORMAL, INK = (200, 150, 0), (40, 40, 40)
 SOFT = ((60, 70, 220), (0, 170, 60), (170, 60, 170), (220, 150, 0))  # of several soft parts, in turn
 THING, MOST_DRAWN = 300, 200_000  # width and height of the picture of a thing [pixels]; Gaussians of it
 RADIUS = 1.9  # distance of a camera in multiples of the longest side of the shown box
+LATTICE = 18  # cells along the picture, each of which shows a normal
 SOLID = 0.1  # opacity of what is shown
 ARROW, TIPS = 0.2, [(a, b) for a in (-0.7, 0.7) for b in (-0.8, -0.27, 0.27, 0.8)]
 """Length of an arrow of the wind over the size of what moves, and where they end, over the half sizes across."""
@@ -98,52 +100,55 @@ def _whole(simulation: Simulation, roles: Roles) -> tuple[list[float], list[floa
 
 
 class View:
-    """A picture and its camera, to draw on in scene units."""
+    """A picture of Gaussians and its camera, to draw on in scene units."""
 
     def __init__(self, colours: Tensor, splat: tuple[Tensor, Tensor, Tensor], camera: Camera) -> None:
         from PIL import Image, ImageDraw, ImageFont
 
-        means, covariances, opacity = splat
         renderer = make_renderer(colours.device, detail=DETAIL)
+        means, covariances, opacity = splat
         plain = torch.full((3,), 0.96, device=colours.device)
         image = renderer(means, covariances, opacity, colours, camera.to(colours.device), plain).color
         self.pixels = (image.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
         self.camera, self.picture = camera, Image.fromarray(self.pixels)
         self.draw, self.font = ImageDraw.Draw(self.picture), ImageFont.load_default(size=14)
 
-    def lines(self, ends: Array, colour: Colour, width: int = 2) -> None:
-        """Lines between pairs of places [scene units], shape (K, 2, 3)."""
-        for a, b in self._seen(ends):
-            self.draw.line([tuple(a), tuple(b)], fill=colour, width=width)
+    def text(self, place: Any, words: str, anchor: str = "la") -> None:
+        """Write words in a place [pixels]."""
+        self.draw.text(place, words, INK, self.font, anchor, stroke_width=2, stroke_fill=(255, 255, 255))
 
-    def arrows(self, ends: Array, colour: Colour) -> None:
-        """Arrows between pairs of places [scene units], their heads in the plane of the picture."""
-        self.lines(ends, colour)
-        for a, b in self._seen(ends):
-            along = (b - a) / max(np.linalg.norm(b - a), 1e-6)
-            size = min(10.0, 0.6 * np.linalg.norm(b - a)) + 1
-            back, across = b - size * along, 0.45 * size * np.array([-along[1], along[0]])
-            self.draw.polygon([tuple(b), tuple(back + across), tuple(back - across)], fill=colour)
+    def lines(self, ends: Array, colour: Colour, width: int = 2, head: float = 0.0) -> None:
+        """Lines between pairs of places in front of the camera [scene units], shape (K, 2, 3), or arrows."""
+        for a, b in self.seen(ends):
+            self.stroke(a, b, colour, width, head)
+
+    def stroke(self, a: Array, b: Array, colour: Colour, width: int, head: float) -> None:
+        """A line between two pixels, or an arrow with a head of some pixels."""
+        self.draw.line([*a, *b], colour, width)
+        if head:
+            back = head * (a - b) / max(np.linalg.norm(a - b), 1e-6)
+            across = 0.45 * back[::-1] * [1, -1]
+            self.draw.polygon([*b, *(b + back + across), *(b + back - across)], colour)
+
+    def seen(self, ends: Array) -> Array:
+        """Pixels of pairs of places that are in front of the camera, shape (K, 2, 2)."""
+        pixel, depth = project(torch.from_numpy(ends.reshape(-1, 3)), self.camera)
+        return pixel.reshape(-1, 2, 2).numpy()[depth.reshape(-1, 2).numpy().min(1) > self.camera.near]
 
     def box(self, low: Array, high: Array, colour: Colour, named: bool = False) -> None:
         """The edges of a box, and the coordinates at the ends of the lowest one along each axis."""
-        corner = np.array(np.meshgrid(*zip(low, high, strict=True), indexing="ij")).reshape(3, -1).T
+        corner = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), -1).reshape(-1, 3)
+        taken: list[Array] = []
         for axis, name in enumerate("xyz"):
-            first = [k for k in range(8) if not k >> (2 - axis) & 1]
+            first = [k for k in range(8) if not k & 4 >> axis]
             edges = np.stack([corner[first], corner[[k + (4 >> axis) for k in first]]], 1)
             self.lines(edges, colour)
-            if named:
-                lowest = max(self._seen(edges), key=lambda edge: edge[:, 1].mean(), default=())
-                for (x, y), corner_of in zip(lowest, (low, high), strict=False):
-                    x, y = min(max(x, 30), self.camera.width - 30), min(y + 4 + 14 * axis, self.camera.height - 14)
-                    words = f"{name} {corner_of[axis] + 0.0:.3g}"
-                    self.draw.text((x, y), words, INK, self.font, "mt", stroke_width=2, stroke_fill=(255, 255, 255))
-
-    def _seen(self, ends: Array) -> Array:
-        """Pixels of pairs of places that are in front of the camera, shape (K, 2, 2)."""
-        pixel, depth = project(torch.as_tensor(np.reshape(ends, (-1, 3))), self.camera)
-        kept = depth.reshape(-1, 2).numpy().min(1) > self.camera.near
-        return pixel.reshape(-1, 2, 2).numpy()[kept]
+            lowest = max(self.seen(edges), key=lambda edge: edge[:, 1].mean(), default=()) if named else ()
+            for place, value in zip(lowest, (low[axis], high[axis]), strict=False):
+                line = sum(np.linalg.norm(place - other) < 20 for other in taken)
+                x, y = min(max(place[0], 30), self.camera.width - 30), place[1] + 4 + 14 * line
+                self.text((x, min(y, self.camera.height - 14)), f"{name} {value + 0.0:.3g}", "ma")
+                taken.append(place)
 
 
 @torch.no_grad()
@@ -164,64 +169,62 @@ def preview_picture(
 
     scene, roles = simulation.scene, classify(simulation)
     frame, parts = scene.frame, scene.parts
-    soft = [] if parts is None else [part.name for part in parts.parts if part.role == "soft"]
+    soft = [part.name for part in parts.parts if part.role == "soft"] if parts is not None else []
     tints = [(n, parts.mask(n), SOFT[k % len(SOFT)]) for k, n in enumerate(soft) if parts and len(soft) > 1]
     x, y, z = frame.direction_to_sim(-simulation.painter.camera_at(0).world_to_camera[2, :3].cpu().double()).tolist()
-    azimuth = math.degrees(math.atan2(y, x))
-    elevation = max(-60.0, min(60.0, math.degrees(math.atan2(z, math.hypot(x, y)))))
+    azimuth, elevation = math.degrees(math.atan2(y, x)), math.degrees(math.atan2(z, math.hypot(x, y)))
     ends = np.array(whole or _whole(simulation, roles))
-    reach = 1.7 * float(np.linalg.norm(np.ptp(ends, axis=0)))  # room for arrows and coordinates
-    flow = mean_flow(simulation).tolist()
-    counts = {name: int(mask.sum()) for name, mask in vars(roles).items() if name != "names"}
-    still = len(roles.simulated) - int((roles.simulated | roles.carried).sum())
+    reach = 1.8 * float(np.linalg.norm(np.ptp(ends, axis=0)))  # room for arrows and coordinates
+    wind = wind_words(mean_flow(simulation).tolist(), frame.rotation[2].tolist())
+
+    def gaussians(mask: Tensor) -> str:
+        return f"{int(mask.sum()):,} Gaussians"
+
     entries = [
-        (REGION, f"box of the {counts['simulated']:,} simulated Gaussians [scene units]"),
-        (HELD, f"held: {counts['pinned']:,} Gaussians"),
-        (WIND, f"steady wind {wind_words(flow, frame.rotation[2].tolist())}"),
+        (REGION, f"box of the {int(roles.simulated.sum()):,} simulated Gaussians [scene units]"),
+        (HELD, f"held: {gaussians(roles.pinned)}"),
+        (WIND, f"steady wind {wind}"),
         (NORMAL, "normals, flipped to the eye"),
-        ((190, 190, 190), f"not simulated: {still:,} Gaussians, greyed"),
-        ((120, 120, 120), f"faint or loose, follow their neighbours: {counts['carried']:,} Gaussians"),
-        *([(PUSHED, f"pushed: {counts['pushed']:,} Gaussians")] if counts["pushed"] else []),
-        *((tint, f"{name}: {int(mask.sum()):,} Gaussians, soft") for name, mask, tint in tints),
+        ((190, 190, 190), f"not simulated: {gaussians(~(roles.simulated | roles.carried))}, greyed"),
+        ((120, 120, 120), f"faint or loose, follow their neighbours: {gaussians(roles.carried)}"),
+        *([(PUSHED, f"pushed: {gaussians(roles.pushed)}")] if bool(roles.pushed.any()) else []),
+        *((tint, f"{name}: {gaussians(mask)}, soft") for name, mask, tint in tints),
     ]
     page = Image.new("RGB", (2 * height, height + 12 + 24 * -(-len(entries) // 2)), (255, 255, 255))
-    for k in range(2):
-        turned = azimuth - 90 * k
-        camera = orbit_camera(ends.mean(0).tolist(), frame.rotation[2], reach, turned, elevation, 40.0, height, height)
-        view = _view(simulation, roles, camera, tints)
-        view.draw.text((8, 6), f"azimuth {turned:.0f}°", INK, view.font)
+    for k, turned in enumerate((azimuth, azimuth - 90)):
+        given = frame.rotation[2], reach, turned, min(max(elevation, -60.0), 60.0), 40.0, height, height
+        view = _view(simulation, roles, orbit_camera(ends.mean(0).tolist(), *given), tints)
+        view.text((8, 6), f"azimuth {turned:.0f}°")
         page.paste(view.picture, (k * height, 0))
     draw = ImageDraw.Draw(page)
     for k, (colour, text) in enumerate(entries):
-        x, y = 14 + k % 2 * height, height + 12 + 24 * (k // 2)
-        draw.rectangle([x, y + 2, x + 16, y + 14], fill=colour)
-        draw.text((x + 26, y), text, INK, view.font)
+        left, top = 14 + k % 2 * height, height + 12 + 24 * (k // 2)
+        draw.rectangle([left, top + 2, left + 16, top + 14], colour)
+        draw.text((left + 26, top), text, INK, view.font)
     return np.asarray(page)
 
 
 def _view(simulation: Simulation, roles: Roles, camera: Camera, tints: Sequence[tuple[str, Tensor, Colour]]) -> View:
     scene, rest = simulation.scene, simulation.scene.rest()
-    model = scene.model
     toward = torch.nn.functional.normalize(camera.position.to(rest.means) - rest.means, dim=-1)
-    colours = roles_tinted(model.colors(-toward).clamp(0, 1), roles, tints)
-    view = View(colours, (rest.means, rest.covariances, model.opacity()), camera)
+    colours, opacity = scene.model.colors(-toward).clamp(0, 1), scene.model.opacity()
+    view = View(roles_tinted(colours, roles, tints), (rest.means, rest.covariances, opacity), camera)
     if is_blank(view.pixels):
         warnings.warn("The preview shows nothing: check that the Gaussians are opaque.", stacklevel=2)
-    means, normals = rest.means.cpu().double(), scene.rest_normals.cpu().double()
-    pixel, depth = project(means, camera)
-    step = camera.height / 26  # one normal for each cell of a lattice over the picture, of the nearest solid Gaussian
-    cell = np.floor(pixel.numpy() / step).astype(int)
-    inside = roles.simulated.numpy() & (depth.numpy() > camera.near) & (cell >= 0).all(1) & (cell < 26).all(1)
-    opaque = inside & (model.opacity().cpu().numpy() >= 0.5)
+    # a normal for each cell of a lattice over the picture: that of the nearest solid Gaussian
+    means, normals = (of.cpu().double().numpy() for of in (rest.means, scene.rest_normals))
+    pixel, depth = (of.numpy() for of in project(torch.from_numpy(means), camera))
+    cell = np.floor(pixel * LATTICE / camera.height).astype(int)
+    inside = roles.simulated.numpy() & (depth > camera.near) & (cell >= 0).all(1) & (cell < LATTICE).all(1)
+    opaque = inside & (opacity.cpu().numpy() >= 0.5)
     index = np.flatnonzero(opaque if opaque.any() else inside)
-    index = index[depth.numpy()[index].argsort()]
-    index = index[np.unique(cell[index] @ [26, 1], return_index=True)[1]]
-    sides = torch.where((toward.cpu() * normals).sum(-1, keepdim=True) < 0, -normals, normals)
-    ends = torch.stack([means, means + 0.035 * scene.size * sides], 1).numpy()[index]
-    view.lines(ends, INK, 3)
-    view.lines(ends, NORMAL, 1)
+    index = index[depth[index].argsort()]
+    index = index[np.unique(cell[index] @ [LATTICE, 1], return_index=True)[1]]
+    sides = normals * np.where((toward.cpu().numpy() * normals).sum(1, keepdims=True) < 0, -1, 1)
+    for colour, width in ((INK, 3), (NORMAL, 1)):
+        view.lines(np.stack([means, means + 0.035 * scene.size * sides], 1)[index], colour, width)
     low, high = (bound.cpu().double().numpy() for bound in scene.bounds)
-    margin = 0.02 * scene.size
+    middle, margin = 0.5 * (low + high), 0.02 * scene.size
     view.box(low - margin, high + margin, REGION, named=True)
     for boundary in conditions(simulation):
         region = getattr(boundary, "region", None)
@@ -229,32 +232,25 @@ def _view(simulation: Simulation, roles: Roles, camera: Camera, tints: Sequence[
             first, last = np.maximum(region.min, low - margin), np.minimum(region.max, high + margin)
             if (first < last).all():
                 view.box(first, last, PUSHED if boundary.held_share is None else HELD)
-    flow = mean_flow(simulation).numpy()
-    if flow.any():
-        along = scene.frame.direction_to_scene(torch.from_numpy(flow / np.linalg.norm(flow))).numpy()
-        across = np.cross(along, np.eye(3)[np.abs(along).argmin()])
-        across /= np.linalg.norm(across)
-        second, half = np.cross(across, along), 0.5 * (high - low)
-        wide, tall, deep = (half @ np.abs(way) for way in (across, second, along))
-        upwind = 0.5 * (low + high) - (deep + 0.06 * scene.size) * along
-        tips = np.array([upwind + a * wide * across + b * tall * second for a, b in TIPS])
-        view.arrows(np.stack([tips - ARROW * scene.size * along, tips], 1), WIND)
-    up = scene.frame.rotation[2].numpy()
-    (a, b) = project(torch.from_numpy(np.stack([0 * up, 0.1 * scene.size * up]) + 0.5 * (low + high)), camera)[0]
-    way = ((b - a) / (b - a).norm().clamp(min=1e-6)).tolist()
+    flow = mean_flow(simulation)
+    if bool(flow.any()):
+        along = scene.frame.direction_to_scene(flow / flow.norm()).numpy()
+        across, half = plane_axes(along).T, 0.5 * (high - low)
+        start = middle - (half @ np.abs(along) + 0.06 * scene.size) * along
+        tips = start + np.array(TIPS) @ (across * (np.abs(across) @ half)[:, None])
+        view.lines(np.stack([tips - ARROW * scene.size * along, tips], 1), WIND, head=10.0)
+    a, b = view.seen(np.stack([middle, middle + 0.1 * scene.size * scene.frame.rotation[2].numpy()])[None])[0]
     base = np.array([26.0, camera.height - 18.0])
-    tip = base + 0.09 * camera.height * np.array(way)
-    view.draw.line([tuple(base), tuple(tip)], fill=INK, width=3)
-    view.draw.text((36, camera.height - 36), "up", INK, view.font)
+    view.stroke(base, base + 0.1 * camera.height * (b - a) / max(np.linalg.norm(b - a), 1e-6), INK, 3, 12.0)
+    view.text((36, camera.height - 36), "up")
     return view
 
 
 def roles_tinted(colours: Tensor, roles: Roles, tints: Sequence[tuple[str, Tensor, Colour]] = ()) -> Tensor:
     """Colours (N, 3) with those of parts and of what is pushed or pinned, and grey where nothing moves."""
-    still = ~(roles.simulated | roles.carried)
-    soft = [(mask, tinted(colours, tint, 0.4)) for _, mask, tint in tints]
-    for mask, shown in [*soft, (still, greyed(colours))]:
-        colours = torch.where(mask.to(colours.device)[:, None], shown, colours)
+    shown = [(mask, tinted(colours, tint, 0.4)) for _, mask, tint in tints]
+    for mask, other in [*shown, (~(roles.simulated | roles.carried), greyed(colours))]:
+        colours = torch.where(mask.to(colours.device)[:, None], other, colours)
     for mask, tint in ((roles.pushed, PUSHED), (roles.pinned, HELD)):
         colours = torch.where(mask.to(colours.device)[:, None], tinted(colours, tint), colours)
     return colours
@@ -273,24 +269,22 @@ def things_picture(cloud: GaussianCloud, place: Place, chosen: Sequence[int], de
     Returns:
         8-bit RGB, shape (H, W, 3), up to four in a row.
     """
-    from PIL import Image
-
-    across, up, means = min(4, len(place.things)), torch.tensor(place.up.direction), cloud.means.numpy()
-    page = Image.new("RGB", (across * THING, -(-len(place.things) // across) * THING), (255, 255, 255))
-    for k, thing in enumerate(place.things):
-        mine, size = np.isin(np.arange(len(cloud)), thing.members), np.subtract(thing.high, thing.low)
+    across, up, means, found = min(4, len(place.things)), torch.tensor(place.up.direction), cloud.means.numpy(), []
+    for number, thing in enumerate(place.things, start=1):
+        size = np.subtract(thing.high, thing.low)
         low, high = thing.low - 0.3 * size.max(), thing.high + 0.3 * size.max()
         index = np.flatnonzero(((means >= low) & (means <= high)).all(1) & ~place.far)
         index = index[:: max(1, len(index) // MOST_DRAWN)]
-        part, reach = cloud.select(torch.from_numpy(index)).to(device), 1.5 * float(np.linalg.norm(size))
-        camera = orbit_camera(np.mean([low, high], 0).tolist(), up, reach, 30.0, 20.0, 40.0, THING, THING)
-        colours = Gaussians.of(part.to("cpu")).colour
+        part = cloud.select(torch.from_numpy(index))
+        colours = Gaussians.of(part).colour
         grey = 0.55 + 0.35 * colours.mean(1, keepdims=True)
-        shown = torch.from_numpy(np.where(mine[index, None], colours, grey)).to(device)
+        shown = torch.from_numpy(np.where(np.isin(index, thing.members)[:, None], colours, grey)).to(device)
+        centre, reach, part = (0.5 * (low + high)).tolist(), 1.5 * float(np.linalg.norm(size)), part.to(device)
+        camera = orbit_camera(centre, up, reach, 30.0, 20.0, 40.0, THING, THING)
         view = View(shown, (part.means, covariance(part.quats, part.scales), part.opacities.sigmoid()), camera)
-        moves = k + 1 in chosen
-        if moves:
+        if number in chosen:
             view.draw.rectangle((1, 1, THING - 2, THING - 2), outline=REGION, width=3)
-        view.draw.text((10, 6), f"{k + 1}" + ("  moves" if moves else ""), INK, view.font)
-        page.paste(view.picture, (k % across * THING, k // across * THING))
-    return np.asarray(page)
+        view.text((10, 6), f"{number}  moves" if number in chosen else f"{number}")
+        found.append(np.asarray(view.picture))
+    found += [np.full_like(found[0], 255)] * (-len(found) % across)
+    return np.concatenate([np.concatenate(found[k : k + across], 1) for k in range(0, len(found), across)])

@@ -10,7 +10,6 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -22,7 +21,7 @@ from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.connectivity import pieces
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.hold import PIN_DEPTH, end_region, given_hold, guess_hold
-from gaussian_swaying.gaussians.measures import FEWEST, Array, Gaussians, Guess, corners, sheet_normal
+from gaussian_swaying.gaussians.measures import FEWEST, Array, Gaussians, corners, sheet_normal
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.geometry.groups import equal_rows, joined
 from gaussian_swaying.geometry.neighbours import particle_spacing
@@ -33,7 +32,6 @@ from gaussian_swaying.simulation.body import SimulatedScene, suggest_spacing
 from gaussian_swaying.simulation.simulation import classify
 from gaussian_swaying.suggestion.kinds import KINDS, kind_of, with_materials
 from gaussian_swaying.suggestion.moves import (
-    Photos,
     given_region,
     main_part,
     move_things,
@@ -42,11 +40,9 @@ from gaussian_swaying.suggestion.moves import (
     sky,
     survey,
 )
-from gaussian_swaying.suggestion.natural import Natural, cloth_start, natural
+from gaussian_swaying.suggestion.natural import cloth_start, natural
 from gaussian_swaying.suggestion.parts import (
     AROUND,
-    FoundParts,
-    Labels,
     flag_on_pole,
     labelled,
     pot_by_colour,
@@ -85,6 +81,7 @@ def suggest(
     quality: str = "normal",
     capture: str | os.PathLike[str] | None = None,
     device: str = "auto",
+    tune: bool = True,
 ) -> Suggestion:
     """Suggest a first simulation of a captured splat, with the numbers with which it sways as its kind does.
 
@@ -102,182 +99,135 @@ def suggest(
         quality: Fineness of the grid: ``draft``, ``normal`` or ``fine``.
         capture: The cameras of the splat's photos (COLMAP or transforms.json), which show up and the object.
         device: Of the simulation.
+        tune: Whether stiffness, mass and drag are made those of its kind, which takes seconds; if not, they are first
+            guesses.
 
     Returns:
         The suggestion.
     """
     path = None if isinstance(splat, GaussianCloud) else Path(splat).resolve()
-    cloud = splat if isinstance(splat, GaussianCloud) else read_gaussians(splat)
-    photos = None if capture is None else read_photos(Path(capture), cloud.origin)
-    found = guess(
-        cloud, up=up, hold=hold, region=region, move=move, longest_side=longest_side, look=look, wind=wind, kind=kind,
-        material=material, quality=quality, photos=photos,
-    )  # fmt: skip
-    return in_whole(swaying(replace(found, path=path), device), cloud)
-
-
-def in_whole(found: Suggestion, cloud: GaussianCloud) -> Suggestion:
-    """The suggestion of some Gaussians for all, of which the others are still."""
-    if found.near is None:
-        return found
-    return replace(found, cloud=cloud, parts=None if found.parts is None else found.parts.within(found.near))
-
-
-def guess(
-    cloud: GaussianCloud,
-    *,
-    up: Sequence[float] | str | None = None,
-    hold: str | None = None,
-    region: Sequence[Sequence[float]] | None = None,
-    move: Sequence[int] | None = None,
-    longest_side: float | None = None,
-    look: str = "breeze",
-    wind: float | None = None,
-    kind: str | None = None,
-    material: str | None = None,
-    quality: str = "normal",
-    photos: Photos | None = None,
-) -> Suggestion:
-    """Guess all but the numbers with which it sways; of a place only the Gaussians near what moves are in the result.
-
-    See :func:`suggest`.
-    """
+    cloud = whole_cloud = splat if isinstance(splat, GaussianCloud) else read_gaussians(splat)
     if longest_side is not None:
         check_positive("--longest-side", longest_side)
     check_choice("--look", look, tuple(LOOKS))
     speed = LOOKS[look].speed if wind is None else wind
     check_positive("--wind", speed, allow_zero=True)
-    if kind is not None:
-        check_choice("--kind", kind, tuple(KINDS))
+    check_choice("--kind", kind or "plant", tuple(KINDS))
     check_choice("--quality", quality, tuple(QUALITIES))
     if move is not None and region is not None:
         raise ValueError("`--move` and `--region` both choose what moves: leave out one of them.")
     if len(cloud) < FEWEST:
         raise ValueError(f"The splat has {len(cloud)} Gaussians, too few for an object; at least {FEWEST} are needed.")
-    splat, near = Gaussians.of(cloud), None
+    # what moves
+    photos = None if capture is None else read_photos(Path(capture), cloud.origin)
+    all_of_it, near = Gaussians.of(cloud), None
     upward = given_up(up) if up is not None else None if photos is None else photos.up
     place, moves = None, tuple(move or (1,))
     if region is None and (photos is None or move is not None):  # photos alone show the object
-        place = survey(splat, upward, [] if photos is None else photos.cameras)
+        place = survey(all_of_it, upward, [] if photos is None else photos.cameras)
     if place is not None:
-        near, moving = move_things(place, splat, moves)
+        near, moving = move_things(place, all_of_it, moves)
     elif move is not None:
         raise ValueError("`--move` chooses things of a place, and this splat is one object: leave it out.")
-    elif region is None and photos is None and (far := sky(splat)).any():
+    elif region is None and photos is None and (far := sky(all_of_it)).any():
         near = ~far
-    if near is not None:
-        cloud, splat = cloud.select(torch.from_numpy(near)), splat[near]
-    if np.ptp(corners(splat.means), axis=0).max() <= 0:
+    gaussians = all_of_it if near is None else all_of_it[near]
+    if np.ptp(corners(gaussians.means), axis=0).max() <= 0:
         raise ValueError("All Gaussians of the splat are at one point: there is no object to simulate.")
-    shown = None if photos is None or region is not None or place is not None else shown_object(splat, photos)
+    shown = None if photos is None or region is not None or place is not None else shown_object(gaussians, photos)
     if place is not None:
         upward, ground = place.up, place.ground[near]
     elif upward is None:
-        upward, ground = guess_up(splat)
+        upward, ground = guess_up(gaussians)
     else:
-        ground = floor_mask(splat, upward.direction) if shown is None else shown.floor(upward.direction)
+        ground = floor_mask(gaussians, upward.direction) if shown is None else shown.floor(upward.direction)
     if region is not None:
-        moving = given_region(splat, *region)
+        moving = given_region(gaussians, *region)
     elif place is None:
-        moving = main_part(splat, ground, CELLS, shown, near is not None)
+        moving = main_part(gaussians, ground, CELLS, shown, near is not None)
+    # its parts and its size
     axis, simulated = np.array(upward.direction), moving.simulated
-
-    def found_parts(found: Labels | None) -> FoundParts | None:
-        height = float(np.ptp(corners(splat.means[simulated] @ axis, 0.002)))
-        return labelled(splat, simulated, height, found)
-
-    plant = flag = laundry = parts = None
+    own, support = gaussians[simulated], None
+    height = float(np.ptp(corners(own.means @ axis, 0.002)))
     if hold is None:
-        own = splat[simulated]
-        plant = found_parts(potted_plant(own, axis))
-        flag = flag_on_pole(own, axis) if plant is None else None
-        laundry = found_parts(washing_line(own, axis)) if plant is None and flag is None else None
-        parts = plant or laundry or (found_parts(flag[0]) if flag else None)
-    if plant is not None and upward.confidence in ("low", "medium"):
+        support = potted_plant(own, axis) or flag_on_pole(own, axis) or washing_line(own, axis)
+    parts = labelled(gaussians, simulated, height, support and support[0])
+    names = [] if parts is None else parts.names
+    plant, laundry = "pot" in names, "post" in names
+    if plant and upward.confidence in ("low", "medium"):
         why = (*upward.reasons, "a plant stands in a pot at the lower end")
         upward = replace(upward, confidence="high", reasons=why)
-    turned = splat.means @ rotation_from_z(upward.direction).numpy()  # z up
-    sized = simulated
+    rotation = rotation_from_z(upward.direction).numpy()
+    turned, sized = gaussians.means @ rotation, simulated  # z up
     if parts is not None:  # the length is that of the whole, with pot or pole and without the ground around it
         sized, simulated = simulated & ~parts.mask(AROUND), simulated & ~parts.mask(role="still")
-        moving = replace(moving, simulated=simulated)
+        own = gaussians[simulated]
     unit = (longest_side or 1.0) / np.ptp(turned[sized], axis=0).max()
-    own, metres = splat[simulated], turned[simulated] * unit
-    size, spacing = np.ptp(metres, axis=0), particle_spacing(torch.from_numpy(own.means)) * unit
-    dx = suggest_spacing(float(size.max()), spacing, CELLS)
+    size, apart = np.ptp(turned[simulated], axis=0), particle_spacing(torch.from_numpy(own.means))
+    dx = suggest_spacing(float(size.max() * unit), apart * unit, CELLS)
+    # where it is held, and its kind
     cell, eyes = dx / unit, None if photos is None else photos.eyes
-    if plant is not None:
-        down = tuple(0.0 - c for c in upward.direction)
-        held = Guess("bottom", down, "medium", (f"a plant in a pot: {plant.reason}",))
-    elif flag is not None:
-        held = Guess("side", flag[1], "high", (f"a flag on its pole: {flag[0][2]}",))
-    elif laundry is not None:
-        held = Guess("top", upward.direction, "high", (f"on a line: {laundry.reason}",))
+    if support is not None:
+        held = support[1]
     elif hold is None:
-        rest = splat.means[~simulated & (splat.opacity >= moving.opacity_threshold)]
+        rest = gaussians.means[~simulated & (gaussians.opacity >= moving.opacity_threshold)]
         wall = None if shown is None else shown.wall(upward.direction)
         held = guess_hold(own, upward.direction, cell, rest, eyes, wall)
     else:
         held = given_hold(hold, upward.direction)
-    pin = None if held.name == "none" or plant is not None else end_region(own.means, held.direction, cell)
-    sure = hold is None and parts is None and held.confidence in ("high", "medium")
-    if pin is not None and sure and held.name == "bottom":
-        depth = max(PIN_DEPTH * float(size[2]), 1.5 * dx) / unit
-        parts = found_parts(pot_by_colour(own, axis) or standing(own, axis, depth))
+    pin = None if held.name == "none" or plant else end_region(own.means, held.direction, cell)
+    if held.name == "bottom" and held.confidence in ("high", "medium") and parts is None:
+        below = pot_by_colour(own, axis) or standing(own, axis, max(PIN_DEPTH * size[2], 1.5 * cell))
+        parts = labelled(gaussians, simulated, height, below)
         pin = pin if parts is None else None
-    sheet, names = sheet_normal(own.means) is not None, [] if parts is None else parts.names
-    leaves = own if parts is None else splat[parts.mask("leaf") & simulated]
+    sheet, leaves = sheet_normal(own.means) is not None, own
+    if parts is not None:
+        names, leaves = parts.names, gaussians[parts.mask("leaf") & simulated]
     name, why_kind = kind_of(own, axis, held.name, sheet, names, leaves)
     if kind is not None:
         name, why_kind = kind, "given"
     of = KINDS[name]
-    if name == "hanging" and held.name == "top" and laundry is None:
-        parts = found_parts(swinging(own, axis, end_region(own.means, held.direction, cell), cell))
-        pin = None
+    if name == "hanging" and held.name == "top" and not laundry:
+        swings = swinging(own, axis, end_region(own.means, held.direction, cell), cell)
+        parts, pin = labelled(gaussians, simulated, height, swings), None
     if longest_side is None:
-        ratio = of.side if laundry is None else POSTS
-        unit, metres, size, spacing = unit * ratio, metres * ratio, size * ratio, spacing * ratio
-        dx = suggest_spacing(float(size.max()), spacing, CELLS)
+        unit *= POSTS if laundry else of.side
+    size, apart = size * unit, apart * unit
     if parts is not None and not sheet:
         parts = with_materials(parts, of, float(size[2]))
-    rotation = rotation_from_z(upward.direction).T
-    azimuth, turn = broad_side(metres), 20.0  # the broad side, seen slightly from the side
-    centre = torch.from_numpy(own.means.mean(0))
-    front = None if eyes is None else photo_azimuth(torch.from_numpy(eyes), centre, rotation)
-    if front is not None:
-        azimuth, turn = front, 0.0
-    flow = across_picture(azimuth)
+    # the wind and the camera
+    azimuth, turn = broad_side(turned[simulated]), 20.0  # the broad side, seen slightly from the side
+    if eyes is not None:
+        centre = torch.from_numpy(own.means.mean(0))
+        front = photo_azimuth(torch.from_numpy(eyes), centre, torch.from_numpy(rotation.T))
+        azimuth, turn = (azimuth, turn) if front is None else (front, 0.0)
+    angle = math.radians(azimuth)
+    flow = np.array([-math.sin(angle), math.cos(angle), 0.0])  # across the picture
     if held.name == "side" and of.cloth:  # along the sheet from the pole, and slightly onto it
-        away = -rotation.numpy() @ held.direction
+        away = -np.array(held.direction) @ rotation
         flow = math.cos(0.25) * away + math.sin(0.25) * np.cross([0.0, 0.0, 1.0], away)
     elif sheet or name in ("hanging", "person"):  # what is flat is moved by wind that hits its face
-        flow = across_picture(azimuth - 90)
-        turn = turn if sheet or front is not None else 50.0
+        flow = np.array([math.cos(angle), math.sin(angle), 0.0])
+        turn = turn if sheet or turn == 0 else 50.0
     outside = ground if shown is None else ground | ~shown.mask
-    outside = outside if parts is None else outside | parts.mask(AROUND)
-    whole = whole_box(splat, simulated, outside, dx / unit)
-    known = known_material(of.material)
-    numbers: dict[str, Any] = {"material": of.material, "youngs_modulus": SHELL_E}
-    numbers |= {"density": known.density, "thickness": known.thickness}
-    if of.cloth:
-        numbers |= {"density": of.mass / CLOTH_THICKNESS, "thickness": CLOTH_THICKNESS, "youngs_modulus": CLOTH_E}
-    if material is not None:
-        known = known_material(material, "--material")
-        numbers = {"material": material, "youngs_modulus": known.E, "real": True}
-        numbers |= {"density": known.density, "thickness": known.thickness}
-    return Suggestion(
-        cloud=cloud,
-        path=None,
+    whole = whole_box(gaussians, simulated, outside if parts is None else outside | parts.mask(AROUND), dx / unit)
+    known = known_material(material or of.material, "--material")
+    numbers = (known.E if material else SHELL_E), known.density, known.thickness
+    if of.cloth and material is None:
+        numbers = CLOTH_E, of.mass / CLOTH_THICKNESS, CLOTH_THICKNESS
+    found = Suggestion(
+        cloud=cloud if near is None else cloud.select(torch.from_numpy(near)),
+        path=path,
         up=upward,
         ground=ground,
-        moving=moving,
+        moving=replace(moving, simulated=simulated),
         hold=held,
         pin=pin,
         longest_side=float(size.max()),
         metres_per_unit=float(unit),
         size=tuple(size.tolist()),
-        spacing=float(spacing),
-        dx=suggest_spacing(float(size.max()), float(spacing), QUALITIES[quality]),
+        spacing=float(apart),
+        dx=suggest_spacing(float(size.max()), float(apart), QUALITIES[quality]),
         quality=quality,
         sheet=sheet,
         azimuth=round(azimuth + turn, 1),
@@ -285,57 +235,55 @@ def guess(
         look=look,
         kind=name,
         kind_reason=why_kind,
+        material=material or of.material,
+        youngs_modulus=numbers[0],
+        density=numbers[1],
+        thickness=numbers[2],
+        real=material is not None,
         whole=whole,
         camera=orbit_frame(whole, (own.means.min(0), own.means.max(0))),
         parts=parts,
         near=near,
         place=place,
         moves=moves if place is not None else (),
-        **numbers,
     )
+    found = tuned(found, device) if tune else found
+    if near is not None:  # the other Gaussians are still
+        found = replace(found, cloud=whole_cloud, parts=found.parts and found.parts.within(near))
+    return found
 
 
-def swaying(found: Suggestion, device: str = "auto") -> Suggestion:
+def tuned(s: Suggestion, device: str) -> Suggestion:
     """The suggestion with the numbers of its kind, a typical stretch of its wind, and its simulation."""
-    kind = KINDS[found.kind]
-    leafy = found.kind in ("plant", "succulent")  # whose leaves are seen one by one
-    simulation = replace(found, connected="surface" if leafy else "grid").to_simulation(device)
+    kind = KINDS[s.kind]
+    leafy = s.kind in ("plant", "succulent")  # whose leaves are seen one by one
+    simulation = replace(s, connected="surface" if leafy else "grid").to_simulation(device)
     if leafy:
-        why = why_apart(simulation.scene, found.dx, classify(simulation).pinned)
-        found = replace(found, connected_reason=why or "", connected="grid" if why is None else "surface")
-        simulation = found.to_simulation(device) if why is None else simulation
-    wind = simulation.wind
-    if found.sways:
+        why = why_apart(simulation.scene, s.dx, classify(simulation).pinned)
+        s = replace(s, connected_reason=why or "", connected="grid" if why is None else "surface")
+        simulation = s.to_simulation(device) if why is None else simulation
+    wind, parts = simulation.wind, s.parts
+    if kind.cloth and s.fixed and not s.real:
+        s = replace(s, start=cloth_start(simulation, kind, s.size))
+    elif s.sways:
         assert isinstance(wind, WindField)
-        found = with_natural(found, natural(simulation, kind, wind.flows[0], LOOKS[found.look].intensity))
-        if not found.by_modes:
-            simulation = found.to_simulation(device)
-    elif kind.cloth and found.fixed:
-        found = replace(found, start=cloth_start(simulation, kind, found.size))
-    return replace(found, simulation=simulation)
+        found = natural(simulation, kind, wind.flows[0], LOOKS[s.look].intensity)
+        ratio = 1.0 if found.lean < MOST_LEAN else found.frequency  # `total` has the ratio at 1 Hz
 
+        def own(part: Part) -> Part:
+            factors = {"thickness": found.thicker, "damping_ratio": ratio}
+            values = {name: (getattr(part, name), factor) for name, factor in factors.items()}
+            scaled = {name: value * factor for name, (value, factor) in values.items() if value is not None}
+            return replace(part, **scaled, E=part.E and found.stiffer.get(part.E, part.E))
 
-def with_natural(found: Suggestion, numbers: Natural) -> Suggestion:
-    """The suggestion with the numbers of its kind, that :func:`~gaussian_swaying.suggestion.natural.natural` found."""
-    s, parts = found, found.parts
-    frequency = 1.0 if numbers.lean < MOST_LEAN else numbers.frequency  # `total` has the ratio at 1 Hz
-
-    def own(part: Part) -> Part:
-        if not part.has_material:
-            return part
-        changed: dict[str, Any] = {"E": numbers.stiffer.get(part.E, part.E) if part.E is not None else None}
-        for name, factor in (("thickness", numbers.thicker), ("damping_ratio", frequency)):
-            value = getattr(part, name)
-            changed[name] = None if value is None else value * factor
-        return replace(part, **changed)
-
-    if parts is not None:
-        parts = replace(parts, parts=Parts(parts.parts.labels, [own(part) for part in parts.parts.parts]))
-    E = numbers.stiffer.get(s.youngs_modulus, s.youngs_modulus)
-    return replace(
-        s, youngs_modulus=E, thickness=s.thickness * numbers.thicker, drag=s.drag * numbers.drag, parts=parts,
-        natural=numbers, start=numbers.start,
-    )  # fmt: skip
+        if parts is not None:
+            parts = replace(parts, parts=Parts(parts.parts.labels, [own(part) for part in parts.parts.parts]))
+        E, thickness = found.stiffer.get(s.youngs_modulus, s.youngs_modulus), s.thickness * found.thicker
+        s = replace(s, youngs_modulus=E, thickness=thickness, drag=found.drag, parts=parts, natural=found)
+        s = replace(s, start=found.start)
+        if not s.by_modes:
+            simulation = s.to_simulation(device)
+    return replace(s, simulation=simulation)
 
 
 def why_apart(scene: SimulatedScene, dx: float, held: Tensor) -> str | None:
@@ -358,12 +306,6 @@ def why_apart(scene: SimulatedScene, dx: float, held: Tensor) -> str | None:
     if beside < ENOUGH or not bool(hangs.all()):
         return None
     return f"{100 * beside:.0f} % lie within reach of a node beside what they are not attached to"
-
-
-def across_picture(azimuth: float) -> Array:
-    """Unit vector to the right of a picture from an azimuth [degrees], z up."""
-    angle = math.radians(azimuth)
-    return np.array([-math.sin(angle), math.cos(angle), 0.0])
 
 
 def broad_side(points: Array) -> float:

@@ -6,11 +6,12 @@ import json
 import math
 import os
 import textwrap
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, is_dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
 import torch
 
 from gaussian_swaying import _program as program
@@ -302,32 +303,13 @@ def run_lines(simulation: Simulation) -> list[str]:
     return ["this configuration", *(f"  {name:<16}{text}" for name, text in lines.items())]
 
 
-def suggestion_dict(s: Suggestion) -> dict[str, Any]:
-    """A suggestion as plain numbers."""
-    parts = None
-    if s.parts is not None:
-        counts = s.parts.parts.labels.bincount(minlength=len(s.parts.names)).tolist()
-        of_part = zip(s.parts.parts.parts, counts, strict=True)
-        parts = {"reason": s.parts.reason, "parts": {p.name: {"role": p.role, "gaussians": n} for p, n in of_part}}
-    plain = ("longest_side", "metres_per_unit", "size", "spacing", "dx", "quality", "sheet", "azimuth", "flow", "look",
-             "kind", "kind_reason", "material", "youngs_modulus", "thickness", "density", "drag", "start")  # fmt: skip
-    found = {name: getattr(s, name) for name in plain}
-    if s.place is not None:
-        things = [asdict(t) | {"members": len(t.members)} for t in s.place.things]
-        found["place"] = {"ground": int(s.place.ground.sum()), "things": things, "moves": s.moves}
-    return found | {
-        "up": asdict(s.up) | {"floor": int(s.ground.sum())},
-        "region": {
-            "region": None if s.moving.region is None else region_dict(s.moving.region),
-            "simulated": int(s.moving.simulated.sum()),
-            "opacity_threshold": s.moving.opacity_threshold,
-            "specks": s.moving.specks,
-        },
-        "hold": asdict(s.hold) | {"region": None if s.pin is None else region_dict(s.pin)},
-        "parts": parts,
-        "formulation": "modes" if s.by_modes else "total",
-        "natural": None if s.natural is None else {k: v for k, v in asdict(s.natural).items() if k != "stiffer"},
-    }
+def as_plain(value: Any) -> Any:
+    """What JSON keeps of a part of a suggestion: of a mask the number of its Gaussians, and of others."""
+    if isinstance(value, Region):
+        return region_dict(value)
+    if isinstance(value, np.ndarray):
+        return int(value.sum()) if value.dtype == bool else len(value)
+    return vars(value) if is_dataclass(value) else repr(value)
 
 
 # ---- the configuration

@@ -12,6 +12,7 @@ import yaml
 from flag_film import TRUTH, camera_of, write_case
 from PIL import Image
 from shared import refused
+from small_scenes import guess
 
 from gaussian_swaying.cli import fit_film
 from gaussian_swaying.cli.camera import painter_of
@@ -25,7 +26,6 @@ from gaussian_swaying.fitting.videos import read_videos
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.recording.video import VideoEncoder
 from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
-from gaussian_swaying.suggestion.suggest import guess
 
 pytest.importorskip("cv2")
 

@@ -180,7 +180,7 @@ def test_a_thing_of_a_place_is_chosen_by_its_number(tmp_path, capsys, monkeypatc
         assert words in told
     assert (out / "things.png").exists()
     found = json.loads((out / "preview.json").read_text())["suggestion"]
-    assert (found["place"]["moves"], len(found["place"]["things"])) == ([2], 2)
+    assert (found["moves"], len(found["place"]["things"])) == ([2], 2)
 
 
 def test_a_weak_guess_comes_with_the_command_of_the_next_best(tmp_path, capsys):
@@ -212,7 +212,7 @@ def test_options_replace_guesses(splat, tmp_path, capsys):
     there = f"([{flow[0]:.3g}, 0, {flow[1]:.3g}] in scene axes)"
     assert there in (tmp_path / "a/starter.yaml").read_text()
     assert there in said
-    assert other["suggestion"]["region"]["simulated"] == 80  # 8 of 15 columns of 10
+    assert other["suggestion"]["moving"]["simulated"] == 80  # 8 of 15 columns of 10
 
 
 def test_a_configuration_is_previewed_as_it_is(splat, tmp_path, capsys):

@@ -37,8 +37,8 @@ def test_the_options_are_those_of_the_command():
     from gaussian_swaying.cli.preview import build_options
 
     named = list(inspect.signature(gs.suggest).parameters)
-    assert named == ["splat", *OPTIONS]
-    assert set(named[1:]) <= set(vars(build_options().parse_args([])))
+    assert named == ["splat", *OPTIONS, "tune"]
+    assert set(OPTIONS) <= set(vars(build_options().parse_args([])))
 
 
 def test_what_it_says(flag):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from shared import unit
-from small_scenes import plain_cloud, started, together, turned_cloud
+from small_scenes import guess, plain_cloud, started, together, turned_cloud
 from things import AWAY, ball, block, guitar_on_a_stand, lamp, man, plant_in_a_pot, splat, tube
 
 from gaussian_swaying.gaussians.hold import cord_heights, end_region, guess_hold
@@ -16,7 +16,7 @@ from gaussian_swaying.geometry.regions import Box, Cylinder
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.body import suggest_spacing
 from gaussian_swaying.suggestion.moves import given_region, suggest_threshold
-from gaussian_swaying.suggestion.suggest import CELLS, CLOTH_E, QUALITIES, broad_side, guess
+from gaussian_swaying.suggestion.suggest import CELLS, CLOTH_E, QUALITIES, broad_side
 from gaussian_swaying.suggestion.up import floor_mask, guess_up
 from gaussian_swaying.wind.turbulence import LOOKS
 

@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 import torch
 from small_captures import write_colmap, write_transforms
-from small_scenes import plain_cloud
+from small_scenes import guess, plain_cloud
 from things import full
 
 from gaussian_swaying.captures.capture_camera import photo_azimuth
 from gaussian_swaying.gaussians.measures import Gaussians
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.suggestion.moves import backdrops, cameras_up, read_photos, seen_share, shown_object
-from gaussian_swaying.suggestion.suggest import guess
 
 TILT = torch.linalg.qr(torch.tensor([[1.0, 0.2, 0.1], [0.0, 1.0, -0.4], [0.3, 0.0, 1.0]], dtype=torch.float64))[0]
 TILT = TILT * torch.linalg.det(TILT)  # a rotation
@@ -83,12 +82,12 @@ def test_up_of_photos_that_were_held_askew():
 def test_up_of_photos_beats_the_shape(tmp_path):
     """A sheet in the plane x-z: convention and shape say y down, the cameras say z up."""
     flag = plain_cloud(full([0.0, -0.002, 0.0], [1.6, 0.002, 0.7], 1500))
-    view = read_photos(write_capture(tmp_path / "a", cameras(ring(), (0.8, 0.0, 0.35))))
-    found = guess(flag, photos=view)
+    capture = write_capture(tmp_path / "a", cameras(ring(), (0.8, 0.0, 0.35)))
+    found = guess(flag, capture=capture)
     assert (found.up.direction, found.up.confidence) == ((0, 0, 1), "high")
     assert found.moving.simulated.sum() == 1500  # a sheet is no backdrop of itself
     assert found.hold.name != "bottom"
-    assert guess(flag, up="+x", photos=view).up.confidence == "given"
+    assert guess(flag, up="+x", capture=capture).up.confidence == "given"
 
 
 # ---- what photos show
@@ -104,9 +103,9 @@ def test_share_of_photos_is_that_of_the_pictures():
 
 def test_wall_and_room_are_left_out(tmp_path):
     trophy, everything = room()
-    view = read_photos(write_capture(tmp_path / "a", cameras(ring(14, 3.0, 0.5, -50, 50), (0.2, 0.0, 0.0))))
-    assert view.focus.tolist() == pytest.approx([0.2, 0, 0], abs=1e-4)
-    found = guess(plain_cloud(everything), photos=view)
+    capture = write_capture(tmp_path / "a", cameras(ring(14, 3.0, 0.5, -50, 50), (0.2, 0.0, 0.0)))
+    assert read_photos(capture).focus.tolist() == pytest.approx([0.2, 0, 0], abs=1e-4)
+    found = guess(plain_cloud(everything), capture=capture)
     simulated = found.moving.simulated
     assert simulated[: len(trophy)].mean() > 0.85  # what is nearest to the wall is taken for it
     assert simulated[len(trophy) :].sum() < 0.05 * len(trophy)
@@ -126,17 +125,16 @@ def test_floor_under_what_photos_show_holds_it(tmp_path):
     plant = torch.cat([full([-0.1, -0.1, 0.0], [0.1, 0.1, 0.5], 800), full([-0.3, -0.3, 0.5], [0.3, 0.3, 1.0], 2000)])
     floor = full([-4.0, -4.0, -0.05], [4.0, 4.0, 0.0], 9000, 1)
     means = torch.cat([plant, floor]).double() @ TILT.T
-    view = read_photos(write_capture(tmp_path / "a", cameras(ring(16, 3.0, 1.5), (0.0, 0.0, 0.4), turn=TILT)))
-    found = guess(plain_cloud(means), photos=view)
+    capture = write_capture(tmp_path / "a", cameras(ring(16, 3.0, 1.5), (0.0, 0.0, 0.4), turn=TILT))
+    found = guess(plain_cloud(means), capture=capture)
     assert list(found.up.direction) == pytest.approx(TILT[:, 2].tolist(), abs=1e-5)
     assert found.ground[len(plant) :].mean() > 0.95
     assert found.moving.simulated[: len(plant)].mean() > 0.85
     assert not found.moving.simulated[len(plant) :].any()
     assert (found.hold.name, found.hold.confidence) == ("bottom", "high")
     assert "what was left out touches its lower end" in found.hold.reasons[0]
-    assert (
-        photo_azimuth(torch.from_numpy(view.eyes), torch.zeros(3), torch.eye(3, dtype=torch.float64)) is None
-    )  # from all around
+    eyes = torch.from_numpy(read_photos(capture).eyes)  # all around
+    assert photo_azimuth(eyes, torch.zeros(3), torch.eye(3, dtype=torch.float64)) is None
 
 
 def test_what_is_no_backdrop():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from small_scenes import plain_cloud, started, together
+from small_scenes import guess, plain_cloud, started, together
 
 from gaussian_swaying.config.parser import parse_text
 from gaussian_swaying.gaussians.measures import Gaussians
@@ -33,7 +33,6 @@ from gaussian_swaying.suggestion.picture import (
     roles_tinted,
     whole_box,
 )
-from gaussian_swaying.suggestion.suggest import guess
 from gaussian_swaying.suggestion.suggestion import region_dict
 from gaussian_swaying.wind.field import FlowKey, WindField
 

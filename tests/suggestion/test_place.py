@@ -7,7 +7,7 @@ import pytest
 import torch
 from places import place
 from shared import unit
-from small_scenes import plain_cloud, together, turned_cloud
+from small_scenes import guess, plain_cloud, together, turned_cloud
 
 from gaussian_swaying import suggest
 from gaussian_swaying.gaussians.measures import Gaussians
@@ -17,7 +17,6 @@ from gaussian_swaying.scenes.alocasia import AlocasiaScene
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.suggestion.moves import move_things, survey
-from gaussian_swaying.suggestion.suggest import guess
 from gaussian_swaying.suggestion.up import given_up
 
 COUNT = 40_000
