@@ -45,7 +45,7 @@ class Nodes:
             they move with the material, and a velocity that is affine in them moves it rigidly up to its border.
         share: Share of each node's mass that belongs to the particles of the boundary, shape (..., G), if it has any.
         threshold: Share above which such a node is held.
-        held_mass: Mass of those particles [kg], shape (...).
+        pinned_mass: Mass of those particles [kg], shape (...).
         mass: Mass of the nodes [kg], shape (..., G).
         fixed: Nodes that pins hold now, bool, shape (..., G); None if none does.
         index: Nodes among which those that are held are, shape (K,); None for all.
@@ -57,13 +57,13 @@ class Nodes:
     lattice: Tensor | None = None
     share: Tensor | None = None
     threshold: float = 0.0
-    held_mass: Tensor | None = None
+    pinned_mass: Tensor | None = None
     mass: Tensor | None = None
     fixed: Tensor | None = None
     index: Tensor | None = None
 
     @property
-    def held(self) -> Tensor:
+    def pinned(self) -> Tensor:
         """Nodes that the particles of the boundary hold, bool, shape (..., G)."""
         assert self.share is not None
         return self.share > self.threshold
@@ -81,14 +81,14 @@ class Boundary(Component, nn.Module, ABC):
         needs_lattice: Whether it uses the positions of lattice points.
         turn: Impulses (0) come before conditions that hold nodes, and rigid parts (2) after them, in whatever order
             they are given.
-        held_share: Share of a node's mass above which the particles of :meth:`particle_mask` hold it in ``total``; None
-            if the condition acts on particles without holding nodes.
+        pinned_share: Share of a node's mass above which the particles of :meth:`particle_mask` hold it in ``total``;
+            None if the condition acts on particles without holding nodes.
     """
 
     needs_position = False
     needs_lattice = False
     turn = 1
-    held_share: float | None = None
+    pinned_share: float | None = None
 
     def __init__(self, start: float = 0.0, end: float | None = None) -> None:
         super().__init__()

@@ -52,7 +52,7 @@ class Settings:
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
+class Pinned:
     """The particles that a boundary holds, and the nodes held through them.
 
     Attributes:
@@ -115,7 +115,7 @@ class Formulation(ABC):
     ) -> None:
         self.points, self.boundaries, self.settings, self.surface = points, tuple(boundaries), settings, surface
         self.laws = LawDispatch(points)
-        self.held = tuple(_held(points, boundary) for boundary in self.boundaries)
+        self.pinned = tuple(_held(points, boundary) for boundary in self.boundaries)
         self.rigid = [k for k, boundary in enumerate(self.boundaries) if boundary.turn == 2]
         self.kinds = tuple(self.hold_kind(k) for k in range(len(self.boundaries)))
         self.on_nodes = tuple(kind in ("nodes", FACE) for kind in self.kinds)
@@ -142,7 +142,7 @@ class Formulation(ABC):
         """The particles of rigid parts, bool, shape (..., P)."""
         found = torch.zeros_like(self.points.mass, dtype=torch.bool)
         for k in self.rigid:
-            held = self.held[k]
+            held = self.pinned[k]
             assert held is not None
             found |= held.mass > 0
         return found
@@ -251,7 +251,7 @@ class Formulation(ABC):
         self,
         velocity: Tensor,
         mass: Tensor,
-        share_of: Callable[[Held], Tensor],
+        share_of: Callable[[Pinned], Tensor],
         position: Tensor | None,
         lattice: Tensor | None,
         time: Tensor,
@@ -275,7 +275,7 @@ class Formulation(ABC):
         taken, fixed = list(self.no_impulse().unbind(-2)), None
         acting = [k for k, acts in enumerate(self.on_nodes) if acts]
         for k in sorted(acting, key=lambda k: self.boundaries[k].turn):
-            boundary, held, before = self.boundaries[k], self.held[k], velocity
+            boundary, held, before = self.boundaries[k], self.pinned[k], velocity
             if held is None:
                 nodes = Nodes(time, dt, position, lattice)
             else:
@@ -284,7 +284,7 @@ class Formulation(ABC):
                 nodes = Nodes(time, dt, position, lattice, share, *known)
             velocity = boundary(velocity, nodes)
             if self.rigid and held is not None and boundary.turn == 1:
-                pinned = nodes.held & boundary.active(time)
+                pinned = nodes.pinned & boundary.active(time)
                 fixed = pinned if fixed is None else fixed | pinned
             with torch.no_grad():
                 taken[k] = (mass[..., None] * (before - velocity)).sum(-2, dtype=torch.float64)
@@ -380,16 +380,16 @@ def flowing(points: MaterialPoints) -> str | None:
     return next((type(law).__name__ for law in points.laws if law.plastic), None)
 
 
-def _held(points: MaterialPoints, boundary: Boundary) -> Held | None:
+def _held(points: MaterialPoints, boundary: Boundary) -> Pinned | None:
     position = points.position.detach()
     mask = boundary.particle_mask(position)
     if mask is None:
         return None
     mass = torch.where(mask, points.mass, 0.0)
-    return Held(mass, mass.sum(-1), boundary.release_time(position))
+    return Pinned(mass, mass.sum(-1), boundary.release_time(position))
 
 
-def held_share(held: Held, stencil: Stencil, inverse_mass: Tensor, time: Tensor) -> Tensor:
+def pinned_share(held: Pinned, stencil: Stencil, inverse_mass: Tensor, time: Tensor) -> Tensor:
     """Share of the mass of each node that held particles have at a time, shape (..., G).
 
     Args:

@@ -208,15 +208,15 @@ class Structure:
 
         total, scene = self.total, self.scene
         pinned = np.full(self.nodes, -1)
-        for k, held in enumerate(total.held):
+        for k, held in enumerate(total.pinned):
             if held is None or not total.on_nodes[k] or k in total.rigid:
                 continue
             assert held.share is not None
             share = held.share.reshape(-1, self.nodes)[scene].detach().cpu().numpy()
             pinned[share > held.threshold] = k
         rows = []
-        if total.pinned is not None:
-            fields = (field[0, scene].detach().cpu().numpy() for field in total.pinned.rows)
+        if total.pinned_rows is not None:
+            fields = (field[0, scene].detach().cpu().numpy() for field in total.pinned_rows.rows)
             node, weight, _, slope, owner, release = fields
             node = node - scene * self.nodes
             for k in range(len(total.kinds)):
@@ -495,11 +495,11 @@ def _content(total: Total, scene: int, most: int) -> str:
     add(_VERSION, SHIFT, LOOSE, CLUSTERS, STIFF_ROW, most, total.grid, points.attached)
     add(points.position.reshape(-1, count, 3)[scene], points.poisson_ratio.reshape(-1, count)[scene])
     add(total.kinds, total.rigid)
-    for held in total.held:
+    for held in total.pinned:
         if held is not None:
             add(held.mass.reshape(-1, count)[scene] > 0, held.threshold)
-    if total.pinned is not None:
-        rows = total.pinned.rows
+    if total.pinned_rows is not None:
+        rows = total.pinned_rows.rows
         add(rows.node[0, scene], rows.weight[0, scene].float(), rows.owner[0, scene])
     return digest.hexdigest()[:32]
 

@@ -51,6 +51,9 @@ from gaussian_swaying.mpm.virtual_nodes import coordinates, first_nodes, first_o
 
 KINDS = ("hinge", "clamp", "nodes")
 
+NODE_SHARE = 0.07
+"""Share of the mass of a node in ``total`` above which pinned particles hold it: the edge is right on average."""
+
 MOST_ROWS = 2000
 """Most rows of one scene: its inverse is dense."""
 
@@ -116,38 +119,34 @@ class PinnedRegion(ParticleBoundary):
     - ``clamp`` holds the face between the particles of the region and the others, halfway between them, and what lies
       behind it. The material cannot turn. It is of second order, for any thickness and depth of the region.
     - ``nodes`` holds the grid nodes of the particles: in ``updated`` all nodes that the particles touch, in ``total``
-      those where they have more than ``held_share`` of the mass. It cannot turn, either. Its effective edge is accurate
-      to a fraction of a cell: in ``total`` it lies between 0.4 cells too far out and 0.4 cells too far in, depending on
-      how the particles lie on the grid, and is right on average with the default share; in ``updated`` it lies about
-      0.7 cells too far in.
+      those where they have more than 7 % of the mass. It cannot turn, either. Its effective edge is accurate to a
+      fraction of a cell: in ``total`` it lies between 0.4 cells too far out and 0.4 cells too far in, depending on how
+      the particles lie on the grid, and is right on average; in ``updated`` it lies about 0.7 cells too far in.
 
     Args:
         region: Region of the pinned particles at rest, in scene units.
         kind: ``hinge`` and ``clamp`` (only in ``total``), ``nodes``, or None. None is ``nodes`` in ``updated``. In
             ``total`` it is ``hinge`` for a sheet (up to 1.25 cells thick where it is held, and at least two cells and
             2.5 thicknesses wide) and for points that are released one by one, and ``clamp`` for anything else.
-        held_share: Share of the nodal mass for ``nodes`` in ``total``, between 0 and 1.
         start: Time from which it acts [s].
         end: Time from which it no longer acts [s]; None for never.
     """
 
     recordable = True
+    pinned_share = NODE_SHARE
 
     def __init__(
         self,
         region: Region,
         kind: str | None = None,
         *,
-        held_share: float = 0.07,
         start: float = 0.0,
         end: float | None = None,
     ) -> None:
         super().__init__(region, start, end)
         if kind is not None:
             check_choice("kind", kind, KINDS)
-        if not 0 <= held_share < 1:
-            raise ValueError(f"Expected `held_share` to lie in [0, 1), but got {held_share}.")
-        self.kind, self.held_share = kind, held_share
+        self.kind = kind
 
     def hold_kind(self, neighbours_fixed: bool) -> str:
         """The ``kind``, or the one that suits the formulation."""
@@ -162,7 +161,7 @@ class PinnedRegion(ParticleBoundary):
         target = (
             torch.zeros_like(velocity) if nodes.lattice is None else self.target(nodes.lattice, nodes.time, nodes.dt)
         )
-        return torch.where((nodes.held & self.active(nodes.time))[..., None], target, velocity)
+        return torch.where((nodes.pinned & self.active(nodes.time))[..., None], target, velocity)
 
 
 def _refused(boundary: Boundary, what: str, instead: str) -> ValueError:
@@ -230,7 +229,6 @@ class Handle(PinnedRegion):
         angular_velocity: Axis of the rotation times its rate [rad/s], z up.
         pivot: Point about which it turns, in scene units at time ``start``; it travels with ``velocity``.
         kind: ``hinge``, ``clamp``, ``nodes`` or None, as for a :class:`PinnedRegion`.
-        held_share: Share of the nodal mass for ``nodes`` in ``total``, between 0 and 1.
         start: Time from which it acts [s].
         end: Time from which it no longer acts [s]; None for never.
     """
@@ -245,11 +243,10 @@ class Handle(PinnedRegion):
         angular_velocity: Sequence[float] = (0.0, 0.0, 0.0),
         pivot: Sequence[float] = (0.0, 0.0, 0.0),
         kind: str | None = None,
-        held_share: float = 0.07,
         start: float = 0.0,
         end: float | None = None,
     ) -> None:
-        super().__init__(region, kind, held_share=held_share, start=start, end=end)
+        super().__init__(region, kind, start=start, end=end)
         turn = check_vector("angular_velocity", angular_velocity)
         self.rate = math.sqrt(sum(c * c for c in turn))
         for name, value in (
@@ -295,9 +292,8 @@ class SequentialRelease(PinnedRegion):
         direction: Direction in which the front travels, in scene axes.
         start: Time at which the front meets the first particle [s]; before that, all are held.
         end: Time at which it passes the last one [s].
-        kind: ``hinge``, ``clamp``, ``nodes`` or None, as for a :class:`PinnedRegion`. Held points are released when the
+        kind: ``hinge``, ``clamp``, ``nodes`` or None, as for a :class:`PinnedRegion`. Points are released when the
             front passes them.
-        held_share: Share of the nodal mass for ``nodes`` in ``total``, between 0 and 1.
         first: Point that the front meets at ``start``, in scene units, instead of the first particle.
         last: Point that it passes at ``end``, in scene units, instead of the last particle; must be given together with
             ``first`` and lie farther along ``direction``.
@@ -310,11 +306,10 @@ class SequentialRelease(PinnedRegion):
         start: float = 0.0,
         end: float = 1.0,
         kind: str | None = None,
-        held_share: float = 0.07,
         first: Sequence[float] | None = None,
         last: Sequence[float] | None = None,
     ) -> None:
-        super().__init__(region, kind, held_share=held_share, start=start, end=end)
+        super().__init__(region, kind, start=start, end=end)
         if not math.isfinite(self.end):
             raise ValueError(f"Expected `end` of the SequentialRelease to be a finite time, but got {end}.")
         if not any(check_vector("direction", direction)):
@@ -409,11 +404,11 @@ class Impulse(ParticleBoundary):
     def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
         """Add the part of the impulse that belongs to the substep."""
         assert nodes.share is not None
-        assert nodes.held_mass is not None
+        assert nodes.pinned_mass is not None
         overlap = (nodes.time + nodes.dt).clamp(max=self.end) - nodes.time.clamp(min=self.start)
         part = (overlap.clamp(min=0) / (self.end - self.start)).to(velocity)
         # in a scene of the batch without such particles all shares are zero
-        per_mass = nodes.share / nodes.held_mass.clamp(min=torch.finfo(velocity.dtype).tiny)[..., None]
+        per_mass = nodes.share / nodes.pinned_mass.clamp(min=torch.finfo(velocity.dtype).tiny)[..., None]
         whole = self.impulse if not self.per_particle else self.count[..., None, None] * self.impulse
         return velocity + per_mass[..., None] * (part * whole.to(velocity))
 
@@ -426,25 +421,19 @@ class RigidRegion(ParticleBoundary):
 
     In each substep the nodes of its particles get the velocities of the rigid motion that has their momentum and
     angular momentum. Soft material pulls the body where it shares nodes with it, and is moved there. In ``updated``
-    these are all nodes that the particles touch, in ``total`` those where they have more than ``held_share`` of the
+    these are all nodes that the particles touch, in ``total`` those where they have more than 7 % of the
     mass, as for a :class:`PinnedRegion` of kind ``nodes``.
 
     A pin of kind ``nodes`` that shares nodes with the body holds it, and a handle of that kind leads it.
 
     Args:
         region: Region of the body at rest, in scene units.
-        held_share: Share of the nodal mass in ``total``, between 0 and 1.
     """
 
     needs_lattice = True
     recordable = True
     turn = 2
-
-    def __init__(self, region: Region, held_share: float = 0.07) -> None:
-        super().__init__(region)
-        if not 0 <= held_share < 1:
-            raise ValueError(f"Expected `held_share` to lie in [0, 1), but got {held_share}.")
-        self.held_share = held_share
+    pinned_share = NODE_SHARE
 
     def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
         """Give the nodes of the body the velocities of a rigid motion."""
@@ -455,7 +444,7 @@ class RigidRegion(ParticleBoundary):
         def part(field: Tensor, dim: int) -> Tensor:
             return field if index is None else field.index_select(dim, index)
 
-        held, own = part(nodes.held, -1), part(velocity, -2)
+        held, own = part(nodes.pinned, -1), part(velocity, -2)
         mass = torch.where(held, in_double(part(nodes.mass, -1)), 0.0)
         if nodes.fixed is not None:
             fixed = part(nodes.fixed, -1) & held
@@ -493,7 +482,7 @@ class _Part(NamedTuple):
 
 def _parts(body: Formulation, k: int) -> Iterator[_Part]:
     """The parts that the ``k``-th boundary pins."""
-    boundary, own, count = body.boundaries[k], body.held[k], body.points.count
+    boundary, own, count = body.boundaries[k], body.pinned[k], body.points.count
     position, mass = body.points.position.reshape(-1, count, 3).cpu().double(), body.points.mass.reshape(-1, count)
     given = boundary.at.detach().cpu().double() if isinstance(boundary, PinnedPoints) else position[0, :0]
     for scene, every in enumerate(position):
@@ -518,7 +507,7 @@ def kind_in_total(body: Formulation, k: int) -> str:
     or a clamped place is to hold a part of several cells in thickness, which it cannot, and if a hinge is wider than a
     line of points.
     """
-    boundary, own, dx = body.boundaries[k], body.held[k], body.settings.dx
+    boundary, own, dx = body.boundaries[k], body.pinned[k], body.settings.dx
     kind, given = boundary.hold_kind(True), isinstance(boundary, PinnedPoints)
     if kind == BY_BODY and _next_to_rigid(body, k):
         return "nodes"
@@ -552,7 +541,7 @@ def kind_in_total(body: Formulation, k: int) -> str:
 
 def _next_to_rigid(body: Formulation, k: int) -> bool:
     """True if a boundary pins particles that may share nodes with a rigid part."""
-    if body.held[k] is None or not body.rigid:
+    if body.pinned[k] is None or not body.rigid:
         return False
     from scipy.spatial import cKDTree
 
@@ -1046,7 +1035,7 @@ def _rows(
         cell: First node of the cell of each particle of the scene, shape (P,).
         virtual: The nodes of each, shape (27, P); None for those of the lattice.
     """
-    boundary, own, kind, dx = body.boundaries[k], body.held[k], body.kinds[k], grid.dx
+    boundary, own, kind, dx = body.boundaries[k], body.pinned[k], body.kinds[k], grid.dx
     place, release = part.place, None
     along = torch.eye(3, dtype=torch.float64)[: 0 if kind == "hinge" else 3]
     if kind == FACE:

@@ -22,7 +22,7 @@ from gaussian_swaying.mpm.boundary import FACE, Boundary
 from gaussian_swaying.mpm.contact import ContactRun, ContactStage, Surface
 from gaussian_swaying.mpm.damping import kelvin_voigt_pk1
 from gaussian_swaying.mpm.dispatch import LawDispatch
-from gaussian_swaying.mpm.formulation import Formulation, Held, Settings, flowing, held_share, safe_inverse
+from gaussian_swaying.mpm.formulation import Formulation, Pinned, Settings, flowing, pinned_share, safe_inverse
 from gaussian_swaying.mpm.pins import (
     PINNED_ALONE,
     POINTS,
@@ -99,9 +99,9 @@ class Total(Formulation):
         if self.needs_position:
             first_moment = self._summed(points.mass[..., None] * position)
             self.node_rest = first_moment * self.node_inverse_mass[..., None]
-        self.held = tuple(
+        self.pinned = tuple(
             held if held is None or not self.on_nodes[k] else self._on_nodes(k, held)
-            for k, held in enumerate(self.held)
+            for k, held in enumerate(self.pinned)
         )
         self.rigid_bodies = [self._body(k) for k in self.rigid]
         self._check_bodies()
@@ -112,7 +112,7 @@ class Total(Formulation):
             assert points.normal is not None
             self.normal = torch.where((points.bending.detach() > 0)[..., None], points.normal, 0.0)
             self.bending_rate = self.bending.fastest(self.node_inverse_mass)
-        self.pinned = self._pinned_rows()
+        self.pinned_rows = self._pinned_rows()
         self.contact = self._contact()
 
     def _summed(self, values: Tensor) -> Tensor:
@@ -147,7 +147,7 @@ class Total(Formulation):
         """
         masks = [
             held.mass > 0
-            for kind, held, boundary in zip(self.kinds, self.held, self.boundaries, strict=True)
+            for kind, held, boundary in zip(self.kinds, self.pinned, self.boundaries, strict=True)
             if kind == FACE and held is not None and boundary.always
         ]
         if not masks:
@@ -161,7 +161,7 @@ class Total(Formulation):
         if not any(kind in POINTS for kind in self.kinds):
             return None
         still, rigid = torch.zeros_like(self.node_mass, dtype=torch.bool), [body.mass > 0 for body in self.rigid_bodies]
-        for kind, held in zip(self.kinds, self.held, strict=True):
+        for kind, held in zip(self.kinds, self.pinned, strict=True):
             if kind == FACE and held is not None and held.share is not None:
                 still = still | (held.share > held.threshold)
         among = torch.stack(rigid).any(0) if rigid else torch.zeros_like(still)
@@ -169,7 +169,7 @@ class Total(Formulation):
         return rows if rows.C.numel() else None  # a clamp that holds everything has no face
 
     def _body(self, k: int) -> _RigidNodes:
-        held = self.held[k]
+        held = self.pinned[k]
         assert held is not None
         assert held.share is not None
         rest, mass = in_double(self.node_positions(self.node_mass)), in_double(self.node_mass)
@@ -197,17 +197,16 @@ class Total(Formulation):
             nodes = self.stencil.first, self.virtual.node
         return ContactStage(surface, self.boundaries, self.kinds, self.grid, inverse, nodes)
 
-    def _on_nodes(self, k: int, held: Held) -> Held:
+    def _on_nodes(self, k: int, held: Pinned) -> Pinned:
         """Return the particles that the ``k``-th boundary holds, with their constant share of the mass of each node."""
         boundary, face = self.boundaries[k], self.kinds[k] == FACE
         share = self._summed(held.mass[..., None])[..., 0] * self.node_inverse_mass
-        threshold = PINNED_ALONE if face else boundary.held_share
+        threshold = PINNED_ALONE if face else boundary.pinned_share
         if threshold is not None and not face and not bool((share > threshold).any()):
             count = int((held.mass > 0).sum())
             raise ValueError(
                 f"The pin {k} holds {count} particles but no grid node: they do not have more than "
-                f"{threshold:g} of the mass of any node; enlarge `region` of the {type(boundary).__name__} or lower "
-                "its `held_share`."
+                f"{threshold:g} of the mass of any node; enlarge `region` of the {type(boundary).__name__}."
             )
         if held.release is not None:
             return replace(held, threshold=threshold or 0.0)
@@ -306,14 +305,14 @@ class Total(Formulation):
     ) -> tuple[Tensor, Tensor]:
         """Apply all boundary conditions: see :meth:`constrain`; points are held last, and exactly."""
         velocity, taken = self.constrain(velocity, self.node_mass, self.share_at(time), position, lattice, time, dt)
-        if self.pinned is not None:
-            velocity, more = self.pinned.hold(velocity, displacement, time, dt)
+        if self.pinned_rows is not None:
+            velocity, more = self.pinned_rows.hold(velocity, displacement, time, dt)
             taken = taken + more.reshape(taken.shape)
         return velocity, taken
 
     def share_at(self, time: Tensor) -> partial[Tensor]:
         """The function for ``constrain`` that returns the share of the nodal mass of held particles at a time."""
-        return partial(held_share, stencil=self.stencil, inverse_mass=self.node_inverse_mass, time=time)
+        return partial(pinned_share, stencil=self.stencil, inverse_mass=self.node_inverse_mass, time=time)
 
     def _accelerate(self, velocity: Tensor, acceleration: Tensor, kick: float, yielding: Tensor | None) -> Tensor:
         """Apply the given acceleration, gravity and damping to node velocities.
@@ -531,21 +530,21 @@ class TotalRun(Run):
         """Collect the nodes and points that pins without a time window hold."""
         bound, active = self.bound, self.active.long()
         owner = torch.full((self.bound.node_mass.numel(),), -1, device=self.device)
-        for k in reversed(range(len(bound.held)) if self.plain else ()):  # the first pin takes the momentum
-            pin = bound.held[k]
+        for k in reversed(range(len(bound.pinned)) if self.plain else ()):  # the first pin takes the momentum
+            pin = bound.pinned[k]
             if bound.on_nodes[k]:
                 assert pin is not None
                 assert pin.share is not None
                 owner = torch.where((pin.share > pin.threshold).reshape(-1), k, owner)
         owner = owner[active]
-        self.held = (owner >= 0).to(torch.int8)
+        self.pinned = (owner >= 0).to(torch.int8)
         # momentum taken from each held node, and a row of zeros
         self.taken = torch.zeros(len(active) + 1, 4, **self.like)
         scene = active // self.grid.node_count
-        self.own_nodes = [_by_scene((owner == k).nonzero()[:, 0], scene, self.scenes) for k in range(len(bound.held))]
+        self.own_nodes = [_by_scene((owner == k).nonzero()[:, 0], scene, self.scenes) for k in range(len(bound.pinned))]
         self.points: InKernels | None = None
-        if self.plain and bound.pinned is not None:
-            self.points = bound.pinned.in_kernels(self.like["dtype"])
+        if self.plain and bound.pinned_rows is not None:
+            self.points = bound.pinned_rows.in_kernels(self.like["dtype"])
             check_indices(self.points.push.numel())
             self.residual = torch.zeros(2, self.points.node.shape[1], 4, **self.like)  # now, and its sum
 
@@ -666,7 +665,7 @@ class TotalRun(Run):
         held = self.plain and any(self.bound.on_nodes)
         moves = self.plain and self.touching is None
         launch(kernels.total_nodes, (-(-nodes // block),))(
-            self.active, source, sources, self.inverse_mass, self.rates, self.held, nodes, partial,
+            self.active, source, sources, self.inverse_mass, self.rates, self.pinned, nodes, partial,
             self.fields, self.shift, self.schedule, self.first_step, offset, *self.gravity, self.taken,
             IMPLICIT=options["IMPLICIT"], POSITION=self.position, WIDTH=width,
             HELD=moves and held, MOVE=moves, DAMPED=self.damped, BLOCK=block,
@@ -676,7 +675,7 @@ class TotalRun(Run):
             self.touching.apply(self.schedule, self.first_step, offset, self.time, self.dt)
         if self.plain and not moves:
             launch(kernels.total_end, (-(-nodes // block),))(
-                self.active, self.inverse_mass, self.held, nodes, self.fields, self.schedule, self.first_step, offset,
+                self.active, self.inverse_mass, self.pinned, nodes, self.fields, self.schedule, self.first_step, offset,
                 self.taken, HELD=held, BLOCK=block, num_warps=4,
             )  # fmt: skip
         if self.points is not None:

@@ -368,7 +368,7 @@ class TotalAdjoint(TotalRun):
 
     def _take_rows(self) -> None:
         """The held points as dense matrices: what rows push, and their weights on the nodes that they move."""
-        points, pinned = self.points, self.bound.pinned
+        points, pinned = self.points, self.bound.pinned_rows
         if points is None or pinned is None:
             return
         place = torch.full((self.bound.node_mass.numel(),), -1, dtype=torch.int32, device=self.device)
@@ -434,7 +434,7 @@ class TotalAdjoint(TotalRun):
             vectors = device_function.per_substep.take(state.time, torch.full_like(state.time, dt), steps)
             numbers = torch.as_tensor(device_function.numbers.take())
         bound = self.bound
-        laws, points, pinned = bound.laws, bound.points, bound.pinned
+        laws, points, pinned = bound.laws, bound.points, bound.pinned_rows
         displacement, velocity = _Rollout.apply(
             run, *state.nodal, laws.mu, laws.lam, points.volume,
             bound.node_inverse_mass, None if pinned is None else pinned.C,
@@ -516,9 +516,9 @@ class TotalAdjoint(TotalRun):
         mass = torch.zeros(inverse.numel(), **self.like).index_copy(0, self.place, self.mass_bar)
         found["inverse_mass"] = mass.reshape(inverse.shape)
         found["stiffness"] = self.stiffness_bar[:, :, :27]
-        if self.points is not None and bound.pinned is not None:
-            weight = torch.zeros_like(bound.pinned.C)
-            weight[0].mT[bound.pinned.real] = self.weight_bar.to(weight)
+        if self.points is not None and bound.pinned_rows is not None:
+            weight = torch.zeros_like(bound.pinned_rows.C)
+            weight[0].mT[bound.pinned_rows.real] = self.weight_bar.to(weight)
             found["weight"] = weight
         if vectors is not None and numbers is not None and vector_bars:
             by_vectors = torch.cat(vector_bars[::-1])
@@ -561,7 +561,7 @@ class TotalAdjoint(TotalRun):
             self.shares = torch.zeros(every, self.pieces, 8, **self.like)
 
     def _find_multipliers(self, count: int) -> None:
-        pinned = self.bound.pinned
+        pinned = self.bound.pinned_rows
         assert pinned is not None
         W = pinned.W[0]
         rates = self.row_history[1 : count + 1].reshape(count, *W.shape[:2], 4).double()
@@ -601,7 +601,7 @@ class TotalAdjoint(TotalRun):
     def _nodes_back(self, offset: int, **stages: bool) -> None:
         block = lanes(self.device, 64, 1)
         launch(nodes_adjoint, (triton.cdiv(self.nodes, block),))(
-            self.active, self.source, len(self.source), self.inverse_mass, self.rates, self.held, self.nodes,
+            self.active, self.source, len(self.source), self.inverse_mass, self.rates, self.pinned, self.nodes,
             self.partial,
             self.fields, self.force_bar, self.history, self.bars, self.mass_bar,
             self.schedule, self.first_step, offset, self.last, *self.gravity,

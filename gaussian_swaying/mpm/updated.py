@@ -23,10 +23,10 @@ from gaussian_swaying.mpm.device_functions import Packed
 from gaussian_swaying.mpm.formulation import (
     MAX_NODES,
     Formulation,
-    Held,
+    Pinned,
     Settings,
-    held_share,
     not_finite,
+    pinned_share,
     safe_inverse,
 )
 from gaussian_swaying.mpm.pins import PinnedRegion
@@ -130,7 +130,7 @@ class Updated(Formulation):
         position = None
         if self.needs_position or self.needs_lattice:
             position = state.grid.node_positions(velocity).expand_as(velocity)
-        share = partial(held_share, stencil=stencil, inverse_mass=inverse_mass[..., 0], time=state.time)
+        share = partial(pinned_share, stencil=stencil, inverse_mass=inverse_mass[..., 0], time=state.time)
         velocity, taken = self.constrain(velocity, nodes[..., 3], share, position, position, state.time, dt)
         new_velocity, affine, gradient = g2p(velocity, stencil)
         identity = torch.eye(3, dtype=gradient.dtype, device=gradient.device)
@@ -158,7 +158,7 @@ class Updated(Formulation):
         """The state with the particles of rigid parts exactly where these are: c + R (X - C), with R as their F."""
         rest = in_double(self.points.position)
         for k in self.rigid:
-            held = self.held[k]
+            held = self.pinned[k]
             assert held is not None
             own, mass = (held.mass > 0)[..., None], in_double(held.mass)
             whole, before = mass.sum(-1)[..., None, None], centre(rest, mass)
@@ -235,7 +235,7 @@ class UpdatedRun(Run):
         self.weight = torch.zeros(0, **self.like)
         self.node_position: Tensor | None = None
         boundaries = bound.boundaries
-        pins = {k: held for k, held in enumerate(bound.held) if held and _pins(boundaries[k], held)}
+        pins = {k: held for k, held in enumerate(bound.pinned) if held and _pins(boundaries[k], held)}
         parts = solids_of(boundaries, pins)
         solids = [part for part, _ in parts or []]
         self.solids = Packed(torch.Size([1]), self.like, fixed=True)
@@ -530,7 +530,7 @@ class UpdatedRun(Run):
         self.impulse.add_(taken)
         self.velocity[:nodes, :3].copy_(velocity.reshape(-1, 3))
 
-    def _share(self, held: Held) -> Tensor:
+    def _share(self, held: Pinned) -> Tensor:
         """Share of the nodal mass that the particles of a boundary hold, shape (..., G)."""
         grid, mass = self.grid, held.mass_at(self.time)
         nodes = grid.node_count * self.scenes
@@ -563,7 +563,7 @@ class UpdatedRun(Run):
         return MPMState(**self._read(self._room), time=self.time, grid=self.grid)
 
 
-def _pins(boundary: Boundary, held: Held) -> bool:
+def _pins(boundary: Boundary, held: Pinned) -> bool:
     return type(boundary) is PinnedRegion and held.release is None
 
 

@@ -843,7 +843,7 @@ def classify(simulation: Simulation) -> Roles:
             continue
         own = moved.particle_mask(where)
         assert own is not None
-        (pushed if boundary.held_share is None else pinned)[index[own.cpu()]] = True
+        (pushed if boundary.pinned_share is None else pinned)[index[own.cpu()]] = True
         names.append(f"{name}: {int(mask.sum()):,} particles")
     return Roles(simulated, carried, pinned, pushed, names)
 

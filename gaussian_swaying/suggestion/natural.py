@@ -23,6 +23,7 @@ from gaussian_swaying.gaussians.hold import columns
 from gaussian_swaying.gaussians.measures import Array, extent, quantile
 from gaussian_swaying.mpm.modal import SHIFT, Structure, analysis_of, factor, rayleigh
 from gaussian_swaying.mpm.modes import MOST_MODES, Modes
+from gaussian_swaying.mpm.pins import NODE_SHARE
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.mpm.total import Total
@@ -226,7 +227,9 @@ def _on_pinned_stems(structure: Structure, leaves: Any, soft: Array, target: flo
     import scipy.sparse as sparse
 
     share = structure.value.T @ (structure.point_mass * ~soft)
-    nodes = (share <= 0.07 * structure.mass) & (structure.pinned < 0) & (structure.mass > 1e-7 * structure.mass.max())
+    nodes = (
+        (share <= NODE_SHARE * structure.mass) & (structure.pinned < 0) & (structure.mass > 1e-7 * structure.mass.max())
+    )
     index = (3 * np.flatnonzero(nodes)[:, None] + np.arange(3)).ravel()
     if len(index) == 0:
         return target

@@ -231,7 +231,7 @@ def _view(simulation: Simulation, roles: Roles, camera: Camera, tints: Sequence[
         if isinstance(region, Box):
             first, last = np.maximum(region.min, low - margin), np.minimum(region.max, high + margin)
             if (first < last).all():
-                view.box(first, last, PUSHED if boundary.held_share is None else HELD)
+                view.box(first, last, PUSHED if boundary.pinned_share is None else HELD)
     flow = mean_flow(simulation)
     if bool(flow.any()):
         along = scene.frame.direction_to_scene(flow / flow.norm()).numpy()

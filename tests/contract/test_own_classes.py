@@ -39,7 +39,7 @@ class Shaker(PinnedRegion):
         before, after = (torch.sin(self.rate * time) for time in (nodes.time, nodes.time + nodes.dt))
         up = (self.amplitude * (after - before) / nodes.dt).to(velocity)
         driven = torch.stack([torch.zeros_like(up), torch.zeros_like(up), up])
-        return torch.where(nodes.held[..., None], driven, velocity)
+        return torch.where(nodes.pinned[..., None], driven, velocity)
 
 
 class SpeedLimit(Boundary):

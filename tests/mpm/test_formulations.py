@@ -30,7 +30,7 @@ def _bar():
 
 
 def _cantilever():
-    """Held at one end and bent by its weight, three to six cells thick."""
+    """Pinned at one end and bent by its weight, three to six cells thick."""
     return _points((0.6, 0.05, 0.1), 0.025, e=1e5), Box([None] * 3, [0.1, None, None]), (0, 0, -9.8)
 
 

@@ -29,6 +29,7 @@ from gaussian_swaying import (
     UniformGust,
     WindField,
 )
+from gaussian_swaying._fixed import changed
 from gaussian_swaying.geometry.linalg import determinant, matmul3
 from gaussian_swaying.mpm.colliders import EnclosingBox, Plane, VelocityBox
 from gaussian_swaying.mpm.laws import LAWS as KINDS
@@ -392,7 +393,7 @@ def test_a_chain_of_stiff_and_soft_links_hangs(formulation):
     position = _lattice(1, 1, links, spacing=h)
     stiffness = torch.tensor([5e5, 5e4] * (links // 2))
     points = _points(position, youngs_modulus=stiffness, poisson_ratio=0.0)
-    pin = PinnedRegion(Box([None, None, 0.26], [None, None, None]), "nodes", held_share=0.2)
+    pin = changed(PinnedRegion(Box([None, None, 0.26], [None, None, None]), "nodes"), pinned_share=0.2)
     # dx = h: neighbours share nodes, and a link is as long as a cell
     simulation = _simulation(points, [pin], formulation=formulation, dx=h, gravity=UP)
     state, log = _advance(simulation, 15)

@@ -157,7 +157,7 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
     row[active] = torch.arange(len(active))
     held = torch.zeros_like(bound.node_mass, dtype=torch.bool)
     planes, obstacles = [], []
-    for boundary, own, acts in zip(bound.boundaries, bound.held, bound.on_nodes, strict=True):
+    for boundary, own, acts in zip(bound.boundaries, bound.pinned, bound.on_nodes, strict=True):
         if isinstance(boundary, Plane):
             planes.append(_plane(boundary))
         elif isinstance(boundary, Obstacle):
@@ -187,8 +187,8 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
         **_samples(bound, row),
     }
     rows = 0
-    if bound.pinned is not None:
-        dense = bound.pinned.in_kernels(torch.float64)
+    if bound.pinned_rows is not None:
+        dense = bound.pinned_rows.in_kernels(torch.float64)
         rows = dense.push.shape[1]
         arrays |= {"rowNode": row[dense.node.long()].T, "rowWeight": dense.weight.T}
         arrays |= {"affected": row[dense.affected.long()], "push": dense.push}

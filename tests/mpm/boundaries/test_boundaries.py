@@ -13,6 +13,7 @@ from shared import double, without_waits
 from torch.testing import assert_close
 
 from gaussian_swaying import Box, Cylinder, MPMSolver, SimFrame, Sphere
+from gaussian_swaying._fixed import changed
 from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.geometry.regions import Everything, Not, Union
 from gaussian_swaying.mpm.boundary import Nodes
@@ -58,7 +59,7 @@ def _acting(name, device, dtype=torch.float64):
         lattice=place + 0.01,
         share=torch.rand(200, generator=generator, dtype=torch.float64).to(device, dtype),
         threshold=0.5,
-        held_mass=torch.tensor(0.7, device=device, dtype=dtype),
+        pinned_mass=torch.tensor(0.7, device=device, dtype=dtype),
         mass=torch.rand(200, generator=generator, dtype=torch.float64).to(device, dtype),
     )
     velocity = torch.randn(200, 3, generator=generator, dtype=torch.float64).to(device, dtype)
@@ -240,8 +241,8 @@ def test_region_that_holds_nothing_names_its_condition(name, framed):
 @pytest.mark.parametrize("kind", ["PinnedRegion", "Handle", "SequentialRelease"])
 def test_share_that_no_node_reaches_names_its_condition(kind):
     """One particle among many at a node: it holds less than the share."""
-    pin = BOUNDARIES[kind](Sphere([0.2333, 0.2333, 0.2333], 0.03), kind="nodes", held_share=0.9)
-    with pytest.raises(ValueError, match=rf"no grid node.*`region` of the {kind} or lower its `held_share`"):
+    pin = changed(BOUNDARIES[kind](Sphere([0.2333, 0.2333, 0.2333], 0.03), kind="nodes"), pinned_share=0.9)
+    with pytest.raises(ValueError, match=rf"no grid node.*enlarge `region` of the {kind}"):
         MPMSolver(dx=0.4, boundaries=[pin]).init_state(block())
 
 
@@ -254,7 +255,6 @@ REFUSED = [
     ("Plane", (ZERO, UNIT), {"start": 1.0, "end": 1.0}, "end"),
     ("EnclosingBox", (ZERO, [1, 0, 1]), {}, "min"),
     ("VelocityBox", (BALL, [1, 2]), {}, "velocity"),
-    ("PinnedRegion", (BALL,), {"held_share": 1.0}, "held_share"),
     ("PinnedRegion", (BALL, "glue"), {}, "kind"),
     ("PinnedPoints", ([],), {}, "at"),
     ("PinnedPoints", ([[0, 0]],), {}, "at"),

@@ -10,6 +10,7 @@ from shared import double, solid
 from torch.testing import assert_close
 
 from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion, SimFrame, Sphere
+from gaussian_swaying._fixed import changed
 from gaussian_swaying.mpm.pins import Handle, Impulse, SequentialRelease
 
 from .bodies import block, in_both, lone, march, near, run_for
@@ -21,9 +22,8 @@ def test_handle_carries_its_particles_and_the_others_follow(formulation):
     points = block()
     rest, velocity = points.position, double([0.4, -0.2, 0.3])
     top = rest[:, 2] > 0.3
-    handle = Handle(
-        Box([None, None, 0.3], [None] * 3), velocity.tolist(), kind="nodes", held_share=0.0, start=0.0099, end=0.0499
-    )
+    above, times = Box([None, None, 0.3], [None] * 3), {"start": 0.0099, "end": 0.0499}
+    handle = changed(Handle(above, velocity.tolist(), kind="nodes", **times), pinned_share=0.0)
     solver = MPMSolver(dx=0.1, formulation=formulation, boundaries=[handle], gravity=(0, 0, 0))
     dt = 2e-3
     states = march(solver, points, dt, 50)

@@ -75,7 +75,7 @@ def _started(points, *boundaries, **settings):
 
 def _rows(solver):
     """Those of the first phase and scene."""
-    return pinning.Rows(*(field[0, 0] for field in solver.bound.pinned.rows))
+    return pinning.Rows(*(field[0, 0] for field in solver.bound.pinned_rows.rows))
 
 
 def _own_places(solver):
@@ -145,7 +145,7 @@ def _across(yaw):
 def test_a_hinge_is_a_line_in_the_middle_plane(make, number):
     points, top, (a, b, c, d), (least, most) = make(number)
     solver = _started(points, PinnedRegion(Chosen(top), "hinge"))
-    rows = solver.bound.pinned.rows.place.reshape(-1, 3)
+    rows = solver.bound.pinned_rows.rows.place.reshape(-1, 3)
     assert float((rows @ double([a, b, c]) - d).abs().max()) < 1e-9
     if make is _strip:
         near(rows[:, 2], torch.full_like(rows[:, 2], number - STEP), 1e-12)
@@ -219,7 +219,7 @@ def test_kept_rows_are_independent_at_any_angle(kind, most, patch):
         pin = PinnedRegion(Chosen(height > -STEP * patch), kind)
         solver = _started(points, pin)
         assert int((_rows(solver).release > 0).sum()) >= 0.8 * 20 * STEP / DX
-        worst = max(worst, _condition(solver.bound.pinned))
+        worst = max(worst, _condition(solver.bound.pinned_rows))
     assert 1.5 < worst < most
 
 
@@ -321,7 +321,7 @@ def test_pins_act_within_their_windows():
     ]
     solver = MPMSolver(DX, boundaries=pins)
     states = _run(solver, points, 200, dt, force=_push(points))
-    assert solver.bound.pinned.starts.tolist() == [0.0495, 0.0795]
+    assert solver.bound.pinned_rows.starts.tolist() == [0.0495, 0.0795]
     for places, first, last in ((None, 0, 149), ([[0.1, 0.0, -0.25]], 50, 200), ([[0.3, 0.0, -0.3]], 80, 200)):
         places = _own_places(solver) if places is None else places
         speed = torch.stack([_read(places, s)[:, 0].abs().max() for s in states])
@@ -468,7 +468,7 @@ def test_the_kind_suits_the_formulation():
 def test_a_subclass_with_its_own_forward_acts_on_nodes():
     class Stopper(PinnedRegion):
         def forward(self, velocity, nodes):
-            return torch.where(nodes.held[..., None], 0.0, velocity)
+            return torch.where(nodes.pinned[..., None], 0.0, velocity)
 
     class Lifter(PinnedRegion):
         def target(self, place, time, dt):
@@ -604,7 +604,7 @@ def test_a_large_face_takes_larger_patches():
     """60 x 60 cells have 14,400 patches of half a cell; their rows would not fit."""
     rest = _box(2, 60, 60, step=0.5)
     solver = _started(_material(rest), PinnedRegion(Chosen(rest[:, 0] < DX), "clamp"))
-    assert 100 < solver.bound.pinned.W.shape[-1] <= MOST_ROWS
+    assert 100 < solver.bound.pinned_rows.W.shape[-1] <= MOST_ROWS
 
 
 # ---- sheet or solid

@@ -219,8 +219,6 @@ def test_what_cannot_be_is_refused():
             solver.init_state(points)
     with pytest.raises(ValueError, match="holds no particle"):
         bar(RigidRegion(Box([9.0] * 3, [10.0] * 3)))[1].init_state(points)
-    with pytest.raises(ValueError, match="`held_share` to lie in"):
-        RigidRegion(RIGHT, held_share=1.0)
 
 
 def test_in_total_a_part_falls_on_the_ground_and_rests_there():

@@ -12,6 +12,7 @@ from catalogue import BOUNDARIES as KINDS
 from catalogue import ELASTIC, MESH, PLASTIC, conditions, made
 
 from gaussian_swaying import AeroForce, WindField, WindForce
+from gaussian_swaying._fixed import changed
 from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.geometry.regions import Everything
 from gaussian_swaying.kernels.launch import lanes
@@ -44,17 +45,27 @@ WINDOW = {"start": 0.5 * DT, "end": 1.5 * DT}  # of three substeps the first and
 HANDLE = made("Handle", LEFT, [0.5, 0.0, 0.2], [0.0, 30.0, 9.0], [0.1, 0.1, 0.1])
 RELEASE = made("SequentialRelease", LEFT, [0.0, 1.0, 0.0], end=1.5 * DT)
 HINGE, NODES = made("PinnedRegion", LEFT), made("PinnedRegion", LEFT, "nodes")
-TOP_NODES = made("PinnedRegion", TOP, "nodes", held_share=0.4)
 SLOPE = made("Plane", [0.0, 0.0, 0.13], [0.1, 0.0, 1.0])
 FLOOR = made("Plane", [0.0, 0.0, 0.13], [0.0, 0.0, 1.0], "sticky")
 BOX = made("EnclosingBox", [0.1, 0.1, 0.1], [0.2, 0.2, 0.2], "slip", 0.2)
 ONE = made("PinnedPoints", [[0.2, 0.1, 0.1]])
 PATH = KeyedPath([DT, 30 * DT], [[0.0, 0.0, 0.0], [0.2, -0.1, 0.05]], [[0.0, 10.0, 20.0], [50.0, -20.0, 90.0]])
+
+
+def sharper(pin, share):
+    """A pin that holds only nodes that are mostly its own."""
+    return changed(pin, pinned_share=share)
+
+
+def top_nodes():
+    return sharper(made("PinnedRegion", TOP, "nodes")(), 0.4)
+
+
 BOUNDARIES = {
     "none": list,
     "pin": lambda: [NODES()],
     "hinge": lambda: [HINGE()],
-    "two pins": lambda: [NODES(), TOP_NODES()],
+    "two pins": lambda: [NODES(), top_nodes()],
     "pin for some time": lambda: [NODES(**WINDOW)],
     "hinge for some time": lambda: [HINGE(**WINDOW)],
     "handle": lambda: [HANDLE(kind="nodes", **WINDOW)],
@@ -85,8 +96,8 @@ BOUNDARIES = {
 POINT_HOLDS = {  # for `total` alone
     "clamp": lambda: [HINGE(kind="clamp")],
     "points": lambda: [made("PinnedPoints", [[0.1, 0.12, 0.11], [0.2, 0.17, 0.13]])()],
-    "hinge and nodes": lambda: [HINGE(), TOP_NODES()],
-    "nodes, hinge and clamp": lambda: [HINGE(), TOP_NODES(), ONE(kind="clamp"), NODES(held_share=0.5)],
+    "hinge and nodes": lambda: [HINGE(), top_nodes()],
+    "nodes, hinge and clamp": lambda: [HINGE(), top_nodes(), ONE(kind="clamp"), sharper(NODES(), 0.5)],
     "points and plane": lambda: [ONE(), FLOOR()],
     "points one after the other": lambda: [
         HINGE(end=1.5 * DT),
