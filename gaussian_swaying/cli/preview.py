@@ -86,7 +86,11 @@ def suggested(options: argparse.Namespace) -> Suggestion:
         given["region"] = (options.region[:3], options.region[3:])
     if options.move is not None:
         given["move"] = _numbers(options.move)
-    return replace(suggest(read_gaussians(path, 0) if _large(path) else path, **given), path=path)
+    begin = Stopwatch()
+    cloud = read_gaussians(path, 0 if _large(path) else None)
+    seconds = begin.quiet
+    found = suggest(cloud, **given)
+    return replace(found, path=path, seconds=found.seconds + seconds)
 
 
 def _large(path: Path) -> bool:
@@ -97,12 +101,10 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> list[str]:
     """Suggest a configuration for a splat, write it with a picture and the numbers, and say what was guessed."""
     import imageio.v3 as iio
 
-    begin = Stopwatch()
     found = suggested(options)
     simulation, cloud = found.simulation, found.cloud
     assert simulation is not None
-    drawn = len(cloud) / len(simulation.scene.model.means)
-    cost = estimate_cost(simulation, options.frames, LOADED + begin.on(simulation.device), whole=drawn)
+    cost = estimate_cost(simulation, options.frames, LOADED + found.seconds, cloud=cloud if found.place else None)
     names = write_starter(found, folder, options.frames)
     iio.imwrite(folder / "preview.png", found.picture(options.height))
     things = found.things()

@@ -11,6 +11,9 @@ import torch
 
 from gaussian_swaying._files import PNG
 from gaussian_swaying._provenance import cores, describe_device
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.harmonics import SH_DC
+from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.kernels.cpu import compiled
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.recording.writer import WORKERS
@@ -68,7 +71,7 @@ def estimate_cost(
     startup_seconds: float = 0.0,
     budget: float = BUDGET,
     pictures: bool = True,
-    whole: float = 1.0,
+    cloud: GaussianCloud | None = None,
 ) -> Cost:
     """Start a run, and measure its first frames and a picture.
 
@@ -81,7 +84,7 @@ def estimate_cost(
         startup_seconds: Time to prepare the run [s], if known.
         budget: Time for the frames that are timed [s], about.
         pictures: Whether pictures count, if the run makes some.
-        whole: Gaussians that the run draws, over those of ``simulation``.
+        cloud: All Gaussians that the run draws, if those of ``simulation`` are some of them.
     """
     solver, state, device = simulation.solver, simulation.start(), simulation.device
     at_rest, warm_up, seconds = solver.substeps(state, simulation.frame_dt), 0.0, 0.0
@@ -114,7 +117,7 @@ def estimate_cost(
         substeps=substeps,
         substep_seconds=seconds,
         simulation_seconds=seconds * substeps * (frames - 1),
-        picture_seconds=_picture_seconds(simulation, state, seconds * substeps, whole) if drawn else None,
+        picture_seconds=_picture_seconds(simulation, state, seconds * substeps, cloud) if drawn else None,
         startup_seconds=startup_seconds + warm_up,
     )
 
@@ -138,11 +141,12 @@ def _substep_seconds(simulation: Simulation, state: State, at_rest: int) -> floa
         steps = min(8 * steps, at_rest)
 
 
-def _picture_seconds(simulation: Simulation, state: State, frame: float, whole: float) -> float:
+def _picture_seconds(simulation: Simulation, state: State, frame: float, cloud: GaussianCloud | None) -> float:
     """Time that the pictures of a frame add to the ``frame`` seconds without [s].
 
     Further threads and ffmpeg write the files and the video. If there are more than two cores, they use the others, and
-    the run waits only for what they cannot write in the time of a frame.
+    the run waits only for what they cannot write in the time of a frame. Every tenth and every fifth one of all
+    Gaussians tell how the time grows with their number.
     """
     import imageio.v3 as iio
 
@@ -154,9 +158,25 @@ def _picture_seconds(simulation: Simulation, state: State, frame: float, whole: 
         for _ in range(2):
             iio.imwrite("<bytes>", pixels, extension=".png", **PNG)
 
-    draw = count * whole * min(_seconds(simulation, lambda: painter.render(state, 0)) for _ in range(2))
+    draw = count * min(_seconds(simulation, lambda: painter.render(state, 0)) for _ in range(2))
+    if cloud is not None:
+        tenth, fifth = (_drawn(simulation, cloud.select(torch.arange(0, len(cloud), k))) for k in (10, 5))
+        each = max(fifth - tenth, 0.0) / (0.1 * len(cloud))
+        draw += count * each * (len(cloud) - len(painter.scene.model.means))
     write = count * min(_seconds(simulation, encode) for _ in range(2))
     return draw + write if free <= 2 else max(draw, write / min(WORKERS, free - 1) - frame)
+
+
+def _drawn(simulation: Simulation, cloud: GaussianCloud) -> float:
+    """Time to draw Gaussians from the camera of a run [s]."""
+    painter, some = simulation.painter, cloud.to(simulation.device)
+    camera, colours = painter.camera_at(0), 0.5 + SH_DC * some.sh[:, 0]
+    shape, opacity = covariance(some.quats, some.scales), some.opacities.sigmoid()
+
+    def draw() -> None:
+        painter.renderer(some.means, shape, opacity, colours, camera, painter.background)
+
+    return min(_seconds(simulation, draw) for _ in range(2))
 
 
 def _seconds(simulation: Simulation, work: Callable[[], object]) -> float:
@@ -181,9 +201,14 @@ class Stopwatch:
     def wall(self) -> float:
         return self._now()[0] - self._begin[0]
 
+    @property
+    def quiet(self) -> float:
+        """The smaller of wall-clock and processor time, to exclude the time used by other programs."""
+        return min(now - then for now, then in zip(self._now(), self._begin, strict=True))
+
     def on(self, device: torch.device) -> float:
-        """Time for work on a device: on a GPU until it is finished, else without the time used by other programs."""
+        """Time for work on a device: on a GPU until it is finished, else :attr:`quiet`."""
         if device.type == "cuda":
             torch.cuda.synchronize(device)
             return self.wall
-        return min(now - then for now, then in zip(self._now(), self._begin, strict=True))
+        return self.quiet

@@ -30,6 +30,7 @@ from gaussian_swaying.mpm.materials import known_material
 from gaussian_swaying.mpm.modes import MOST_LEAN
 from gaussian_swaying.simulation.body import SimulatedScene, suggest_spacing
 from gaussian_swaying.simulation.simulation import classify
+from gaussian_swaying.suggestion.cost import Stopwatch
 from gaussian_swaying.suggestion.kinds import KINDS, kind_of, with_materials
 from gaussian_swaying.suggestion.moves import (
     given_region,
@@ -105,8 +106,10 @@ def suggest(
     Returns:
         The suggestion.
     """
+    begin = Stopwatch()
     path = None if isinstance(splat, GaussianCloud) else Path(splat).resolve()
     cloud = whole_cloud = splat if isinstance(splat, GaussianCloud) else read_gaussians(splat)
+    seconds = begin.quiet
     if longest_side is not None:
         check_positive("--longest-side", longest_side)
     check_choice("--look", look, tuple(LOOKS))
@@ -246,6 +249,7 @@ def suggest(
         near=near,
         place=place,
         moves=moves if place is not None else (),
+        seconds=seconds,
     )
     found = tuned(found, device) if tune else found
     if near is not None:  # the other Gaussians are still
@@ -255,7 +259,7 @@ def suggest(
 
 def tuned(s: Suggestion, device: str) -> Suggestion:
     """The suggestion with the numbers of its kind, a typical stretch of its wind, and its simulation."""
-    kind = KINDS[s.kind]
+    kind, begin = KINDS[s.kind], Stopwatch()
     leafy = s.kind in ("plant", "succulent")  # whose leaves are seen one by one
     simulation = replace(s, connected="surface" if leafy else "grid").to_simulation(device)
     if leafy:
@@ -283,7 +287,7 @@ def tuned(s: Suggestion, device: str) -> Suggestion:
         s = replace(s, start=found.start)
         if not s.by_modes:
             simulation = s.to_simulation(device)
-    return replace(s, simulation=simulation)
+    return replace(s, simulation=simulation, seconds=s.seconds + begin.quiet)
 
 
 def why_apart(scene: SimulatedScene, dx: float, held: Tensor) -> str | None:

@@ -6,7 +6,7 @@ import json
 import math
 import os
 import textwrap
-from dataclasses import dataclass, field, is_dataclass
+from dataclasses import dataclass, is_dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -82,6 +82,7 @@ class Suggestion:
         place: The things of a place; None for an object.
         moves: Numbers of those that move.
         simulation: The simulation of the Gaussians ``near``, with these numbers.
+        seconds: Time to read the splat and to make that simulation [s].
     """
 
     cloud: GaussianCloud
@@ -119,7 +120,8 @@ class Suggestion:
     near: Array | None = None
     place: Place | None = None
     moves: tuple[int, ...] = ()
-    simulation: Simulation | None = field(default=None, repr=False)
+    simulation: Simulation | None = None
+    seconds: float = 0.0
 
     def __repr__(self) -> str:
         return f"Suggestion({self.kind}: {int(self.moving.simulated.sum()):,} Gaussians, held at the {self.hold.name})"

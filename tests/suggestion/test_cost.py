@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import pytest
+import torch
 
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.kernels import cpu
@@ -42,13 +43,25 @@ def test_compiling_is_not_counted(monkeypatch):
     assert (watch.wall, watch.on(device)) == (pytest.approx(0.05), pytest.approx(0.02))
 
 
-@pytest.mark.parametrize(("cores", "seconds"), [(2, 10 * 1 + 4), (4, 10.0), (3, 10.0)])
+@pytest.mark.parametrize(("cores", "seconds"), [(2, 1 + 4), (4, 4 / 2 - 0.5), (9, 1.0)])
 def test_files_are_written_beside_the_simulation_where_there_are_cores(cores, seconds, monkeypatch, make_simulation):
-    """A picture of a tenth of all takes 1 s, and 4 s its files: more threads write them beside."""
+    """A picture of 1 s, and 4 s for its files: further threads write them, and a frame takes 0.5 s without it."""
     simulation, clock = make_simulation(), iter([1.0, 1.0, 4.0, 4.0])
     monkeypatch.setattr(cost_module, "_seconds", lambda simulation, work: next(clock))
+    monkeypatch.setattr(cost_module, "WORKERS", 2 if cores == 4 else 8)
     monkeypatch.setattr(cost_module, "cores", lambda: cores)
-    assert cost_module._picture_seconds(simulation, simulation.start(), 0.5, whole=10.0) == seconds
+    assert cost_module._picture_seconds(simulation, simulation.start(), 0.5, None) == seconds
+
+
+def test_a_place_adds_what_its_other_gaussians_take(monkeypatch, make_simulation):
+    """Here 1 ms to draw each, besides 3 ms, and 0.5 s for all that the simulation has; and nothing to write a file."""
+    simulation = make_simulation()
+    whole = simulation.scene.model.to_cloud().select(torch.arange(960) % 96)
+    clock = iter([0.5, 0.5, 0.0, 0.0])
+    monkeypatch.setattr(cost_module, "_seconds", lambda simulation, work: next(clock))
+    monkeypatch.setattr(cost_module, "_drawn", lambda simulation, cloud: 3e-3 + 1e-3 * len(cloud))
+    found = cost_module._picture_seconds(simulation, simulation.start(), 1e9, whole)
+    assert found == pytest.approx(0.5 + 1e-3 * (960 - 96))
 
 
 @pytest.mark.parametrize("frames", [1, 2, 101])
