@@ -8,8 +8,8 @@ pair is kept at both of its samples; the sums at samples and nodes have the same
 
 from gaussian_swaying.geometry.linalg_triton import add3, dot3, load3
 from gaussian_swaying.kernels.language import ON_GPU, tl, triton
+from gaussian_swaying.mpm.colliders import acts, touch
 from gaussian_swaying.mpm.shared_kernels import VARIES, axis_weights, node_weight, vector
-from gaussian_swaying.mpm.touch import acts, touch
 
 CHANGES = (*VARIES, "places", "touched_nodes", "active_nodes", "last", "iterations")
 

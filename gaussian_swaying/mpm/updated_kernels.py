@@ -22,6 +22,7 @@ from gaussian_swaying.geometry.linalg_triton import (
     transpose,
 )
 from gaussian_swaying.kernels.language import tl, triton
+from gaussian_swaying.mpm.colliders import acts, stop_nodes
 from gaussian_swaying.mpm.damping import kelvin_voigt
 from gaussian_swaying.mpm.dispatch import ROW, kirchhoff
 from gaussian_swaying.mpm.shared_kernels import (
@@ -37,7 +38,6 @@ from gaussian_swaying.mpm.shared_kernels import (
     vector,
     wave_speed,
 )
-from gaussian_swaying.mpm.touch import acts, stop_nodes
 
 REACH = tl.constexpr(3)
 """Shuffles of a sum over neighbours: 2^REACH of them at most are added up before they are added to the grid."""
@@ -402,7 +402,7 @@ def updated_nodes(
     """``updated``: nodal velocities from momenta and masses, set back to zero unless SPARSE; KEEP for boundaries.
 
     All TURNS are applied here, in order: each is the number of a boundary, and that of one of the SOLIDS (see
-    :mod:`~gaussian_swaying.mpm.touch`), or -1 less that of a pin. KINDS says of each solid how it stops. ``marks``
+    :mod:`~gaussian_swaying.mpm.colliders`), or -1 less that of a pin. KINDS says of each solid how it stops. ``marks``
     (pins, room) is the last substep in which each pin held a node, counted from 1. ``clock`` has the time at step 0 and
     the substep [s], float64; ``impulse`` (programs, slots, B, 3), float64, collects the reaction impulses on nodes of
     the first scene of a program, and of those after it. With SPARSE the velocities of programs that are not

@@ -231,7 +231,7 @@ def test_a_simulation_reads_what_is_wrong_with_its_measurements(monkeypatch):
     from gaussian_swaying.simulation.simulation import Simulation
 
     seen = []
-    monkeypatch.setattr(module, "check_end", lambda *given: seen.append(given))
+    monkeypatch.setattr(module, "_check_end", lambda *given: seen.append(given))
     simulation = Simulation(FlagScene(spacing=0.3), wind=[4, 0, 0], device="cpu")
     state, _ = simulation.advance(simulation.start())
     assert seen == []
