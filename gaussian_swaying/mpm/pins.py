@@ -435,6 +435,9 @@ class RigidRegion(ParticleBoundary):
     turn = 2
     pinned_share = NODE_SHARE
 
+    def __init__(self, region: Region) -> None:
+        super().__init__(region)
+
     def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
         """Give the nodes of the body the velocities of a rigid motion."""
         assert nodes.mass is not None

@@ -217,6 +217,8 @@ def test_what_cannot_be_is_refused():
         points, solver = bar(RigidRegion(RIGHT), pin)
         with pytest.raises(ValueError, match="points of a rigid part"):
             solver.init_state(points)
+    with pytest.raises(TypeError, match="start"):
+        RigidRegion(RIGHT, start=0.1)  # it is rigid all the time
     with pytest.raises(ValueError, match="holds no particle"):
         bar(RigidRegion(Box([9.0] * 3, [10.0] * 3)))[1].init_state(points)
 
