@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
 import yaml
 
-from gaussian_swaying.simulation.model import POLAR, find, in_settings, number, of_settings
+from gaussian_swaying.simulation.model import find, in_settings, number
 from gaussian_swaying.simulation.simulation import Simulation
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def changed_settings(parser: ArgumentParser, settings: Namespace, values: Mappin
     return settings
 
 
-def take(simulation: Simulation, parser: ArgumentParser, settings: Namespace, names: Sequence[str]) -> bool:
+def take(simulation: Simulation, parser: ArgumentParser, settings: Namespace, values: Mapping[str, Any]) -> bool:
     """Change a simulation between two steps.
 
     Parameters, the wind, aerodynamic coefficients, shading, background and length of a frame change in motion; the
@@ -61,13 +61,13 @@ def take(simulation: Simulation, parser: ArgumentParser, settings: Namespace, na
         simulation: The simulation.
         parser: From :meth:`Simulation.parser`.
         settings: The settings with all changes.
-        names: The fields and parameters that have changed, with dots.
+        values: New values of numbers by their names, and the other fields that have changed, with dots.
 
     Returns:
         False if another field has changed, so that the simulation has to be made anew.
     """
-    numbers = ["wind.flow" if name in POLAR else name for name in names if find(name) is not None]
-    heads = {name.split(".")[0] for name in names if find(name) is None}
+    numbers = {name: value for name, value in values.items() if find(name) is not None}
+    heads = {name.split(".")[0] for name in values if name not in numbers}
     if not heads <= {"wind", "aero", *PICTURE}:
         return False
     if "frame_dt" in numbers and simulation.model.air is not None:
@@ -78,12 +78,11 @@ def take(simulation: Simulation, parser: ArgumentParser, settings: Namespace, na
         return False
     if settings.wind.schedule is not None or heads & {"wind", "aero"}:  # as a whole
         heads |= {name.split(".")[0] for name in numbers} & {"wind", "aero"}
-        numbers = [name for name in numbers if name.split(".")[0] not in heads]
-    values = {name: of_settings(settings, name) for name in numbers}
+        numbers = {name: value for name, value in numbers.items() if name.split(".")[0] not in heads}
     parts = parser.instantiate(settings) if heads else {}
     painter = simulation.painter
-    if values:
-        simulation.change(values)
+    if numbers:
+        simulation.change(numbers)
     if "wind" in heads:
         simulation.wind = parts["wind"]
     if "aero" in heads:

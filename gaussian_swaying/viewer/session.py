@@ -18,6 +18,7 @@ from gaussian_swaying.mpm.state import State
 from gaussian_swaying.rendering.gsplat_renderer import make_renderer
 from gaussian_swaying.rendering.thinning import DETAIL
 from gaussian_swaying.simulation.measure import FrameDiagnostics, SimulationDiverged
+from gaussian_swaying.simulation.model import find, of_settings
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.changes import changed_settings, take
 from gaussian_swaying.viewer.pull import Pull
@@ -361,17 +362,17 @@ class Session:
 
     def _change(self, values: Mapping[str, Any]) -> None:
         before, now = self.settings, time.monotonic()
-        self._apply(changed_settings(self.parser, self.settings, values), list(values))
+        self._apply(changed_settings(self.parser, self.settings, values), values)
         last = self._past[-1] if self._past else None
         if last is not None and last.names == list(values) and now - last.time < ONE_CHANGE:
             last.time = now
         else:
             self._past.append(Past(before, list(values), now))
 
-    def _apply(self, settings: Namespace, names: list[str]) -> None:
+    def _apply(self, settings: Namespace, values: Mapping[str, Any]) -> None:
         if not self._broken:
             self.problem = None
-        if take(self.simulation, self.parser, settings, names):
+        if take(self.simulation, self.parser, settings, values):
             self.settings = settings
             self._publish(self.snapshot.state, self.snapshot.health)
         else:
@@ -384,7 +385,8 @@ class Session:
         if past.names is None or self._broken:
             self._take_settings(past.settings, fresh=True)
         else:
-            self._apply(past.settings, past.names)
+            values = {name: of_settings(past.settings, name) if find(name) else None for name in past.names}
+            self._apply(past.settings, values)
         self._past.pop()
         self.revision += 1
 
