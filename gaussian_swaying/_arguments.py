@@ -29,18 +29,21 @@ def checked(function: F) -> F:
     return whole  # type: ignore[return-value]
 
 
-def check_arguments(function: Callable[..., Any], given: Mapping[str, Any], where: str) -> None:
+def check_arguments(
+    function: Callable[..., Any], given: Mapping[str, Any], where: str = ".", wider: Mapping[str, Any] | None = None
+) -> None:
     """Raise TypeError unless arguments have the types of a function's annotations; ValueError for an unknown word.
 
     Args:
         function: The function.
         given: Its arguments by name; others are ignored.
         where: Its name in the message, or what comes before that of an argument, as in ``material.``.
+        wider: Types in place of annotations.
     """
-    for name, kind in _hints(function).items():
+    for name, kind in (_hints(function) | dict(wider or {})).items():
         if name in given and not _fits(given[name], kind):
             error = ValueError if isinstance(given[name], str) and "one of" in _words(kind) else TypeError
-            named = f"`{where}{name}`" if where.endswith(".") else f"`{name}` of {where}"
+            named = f"`{where}{name}`".replace("`.", "`") if where.endswith(".") else f"`{name}` of {where}"
             raise error(f"Expected {named} to be {_words(kind)}, but got {shown(given[name])}.")
 
 

@@ -6,7 +6,7 @@ import copy
 import dataclasses
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field, is_dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor
 
-from gaussian_swaying._arguments import shown
 from gaussian_swaying._checks import (
     VectorLike,
     check_choice,
@@ -36,17 +35,14 @@ from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.neighbours import particle_spacing
 from gaussian_swaying.geometry.regions import Region, RegionInFrame
 from gaussian_swaying.mpm.boundary import Boundary
-from gaussian_swaying.mpm.contact import Contact
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.laws.law import ConstitutiveLaw
 from gaussian_swaying.mpm.pins import PinnedPoints, PinnedRegion
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
-from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera import azimuth_beside
 from gaussian_swaying.rendering.cameras.camera_path import CameraPath, OrbitCamera
-from gaussian_swaying.rendering.shading import Shader
 from gaussian_swaying.scenes.procedural import GivenScene, ProceduralScene
 from gaussian_swaying.simulation.body import PLATE, Material, Scene, SimulatedScene, suggest_spacing
 from gaussian_swaying.wind.computed_air import ComputedAir
@@ -805,37 +801,13 @@ def as_camera(
     return OrbitCamera() if azimuth is None else OrbitCamera(azimuth=azimuth)
 
 
-def check_types(given: Mapping[str, Any]) -> None:
-    """Raise TypeError if an argument is not of its kind; None is accepted.
-
-    Args:
-        given: Arguments of a simulation by their names.
-    """
-    for name, value in given.items():
-        if name in _KINDS and value is not None and not isinstance(value, _KINDS[name]):
-            words = " or ".join(kind.__name__ for kind in _KINDS[name])
-            raise TypeError(f"Expected `{name}` to be a {words}, but got {shown(value)}.")
-        for part in value if name in _LISTS and isinstance(value, list | tuple) else ():
-            if not isinstance(part, _LISTS[name]) and not (name == "forces" and callable(part)):
-                words = " or ".join(kind.__name__ for kind in _LISTS[name])
-                raise TypeError(f"Expected `{name}` to be a list of {words}, but it has {shown(part)}.")
-
-
-_KINDS: dict[str, tuple[type, ...]] = {
-    "scene": (Scene, ProceduralScene, GaussianCloud, str, os.PathLike),
-    "material": (Material, str),
-    "solver": (Solver,),
-    "cloud": (GaussianCloud,),
-    "contact": (Contact,),
-    "aero": (AeroForce,),
-    "forces": (list, tuple),
-    "shader": (Shader,),
-    "camera": (CameraPath,),
-    "cameras": (Mapping,),
-    "edits": (list, tuple),
-    "copies": (list, tuple),
-    "recorder": (Recorder,),
-    "normalisation": (Normalisation,),
-    "hold": (Region, PinnedRegion, PinnedPoints, list, tuple, str),
+WIDER: dict[str, Any] = {
+    "scene": Scene | ProceduralScene | GaussianCloud | str | os.PathLike,
+    "material": Material | str | None,
+    "solver": Solver | None,
+    "wind": Any,
+    "device": Any,
+    "forces": list[Force | Callable[..., Any]],
+    "hold": HoldLike | None,
 }
-_LISTS = {"forces": (Force,), "edits": (Edit,), "copies": (Copy,), "hold": (Region, PinnedRegion, PinnedPoints)}
+"""What a simulation takes in Python where its annotations say what a file can contain."""

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying._checks import check_choice, check_frames, check_positive, check_vector
+from gaussian_swaying._arguments import check_arguments
+from gaussian_swaying._checks import check_frames, check_positive, check_vector
 from gaussian_swaying._files import sha256
 from gaussian_swaying._fixed import Fixed, changed
 from gaussian_swaying._turns import Turn, in_turn
@@ -57,6 +58,7 @@ from gaussian_swaying.simulation.body import Material, SimulatedScene, with_part
 from gaussian_swaying.simulation.draw import CopiesPainter, Frame, Painter, frames_from
 from gaussian_swaying.simulation.measure import FrameDiagnostics, SimulationDiverged
 from gaussian_swaying.simulation.model import (
+    WIDER,
     Copy,
     DeviceLike,
     Edit,
@@ -72,7 +74,6 @@ from gaussian_swaying.simulation.model import (
     as_scene,
     as_solver,
     as_wind,
-    check_types,
     resolve_device,
 )
 from gaussian_swaying.simulation.record import Run
@@ -207,9 +208,8 @@ class Simulation(Fixed):
         cloud: GaussianCloud | None = None,
     ) -> None:
         given = {name: value for name, value in locals().items() if name not in ("self", *NOT_COMPARED)}
+        check_arguments(type(self).__init__, given | {"recorder": recorder, "cloud": cloud}, wider=WIDER)
         check_positive("frame_dt", frame_dt)
-        check_types(given | {"recorder": recorder, "cloud": cloud})
-        check_choice("dtype", dtype, ("float32", "float64"))
         colour = check_vector("background", background)
         target = resolve_device(device)
         wait_for_device = load_ahead(target)
@@ -328,7 +328,6 @@ class Simulation(Fixed):
 
     @wind.setter
     def wind(self, wind: WindLike | None) -> None:
-        check_types({"wind": wind})
         self.adopt(self.model.replace(wind=as_wind(wind, self.scene.frame)))
 
     @property
@@ -338,7 +337,7 @@ class Simulation(Fixed):
 
     @aero.setter
     def aero(self, aero: AeroForce | None) -> None:
-        check_types({"aero": aero})
+        check_arguments(Simulation.__init__, {"aero": aero})
         self.adopt(self.model.replace(aero=aero or AeroForce()))
 
     @property
@@ -371,7 +370,7 @@ class Simulation(Fixed):
 
     @recorder.setter
     def recorder(self, recorder: Recorder | None) -> None:
-        check_types({"recorder": recorder})
+        check_arguments(Simulation.__init__, {"recorder": recorder})
         self._recorder = self._recorder_or(recorder)
 
     def _recorder_or(self, recorder: Recorder | None) -> Recorder:

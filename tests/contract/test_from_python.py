@@ -121,7 +121,7 @@ def test_several_pins():
     moved = (last.state.position - simulation.scene.points.position).norm(dim=-1)
     x = simulation.scene.points.position[:, 0]
     assert float(moved[(x == x.min()) | (x == x.max())].max()) < 0.05 * float(moved.max())
-    with pytest.raises(TypeError, match="`hold` to be a list of Region or PinnedRegion or PinnedPoints"):
+    with pytest.raises(TypeError, match="`hold` to be a Region or a PinnedRegion or a PinnedPoints or a list of"):
         _flag(hold=[POLE, "foot"])
     (guessed,) = _flag(hold="auto").solver.boundaries
     assert repr(guessed.region) == repr(_flag().solver.boundaries[0].region).replace("0.11", "0.35")  # 1.5 cells
