@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import inspect
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import is_dataclass
 from functools import wraps
@@ -181,7 +182,7 @@ def _brief(value: object) -> str:
     if isinstance(value, torch.Tensor):
         return _brief(value.tolist()) if value.numel() < 5 else f"{tuple(value.shape)}"
     if isinstance(value, float):
-        return f"{value:g}"
+        return f"{value:g}" if math.isfinite(value) else "None"  # which is how it was given
     if isinstance(value, list | tuple | nn.ModuleList):
         return f"[{', '.join(map(_brief, value))}]" if len(value) < 9 else f"{len(value):,} entries"
     return repr(value)
