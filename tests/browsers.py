@@ -31,3 +31,8 @@ def until(condition, seconds=60.0):
     while not condition():
         assert time.monotonic() < end, "it did not happen"
         time.sleep(0.01)
+
+
+def reached(session, time):
+    """Wait until a session has come to a time [s]."""
+    until(lambda: session.snapshot.health.time > time)

@@ -3,14 +3,18 @@
 import warnings
 from contextlib import contextmanager
 
+import pytest
 import torch
+from torch.testing import assert_close
 
-from gaussian_swaying import MaterialPoints
+from gaussian_swaying import Box, MaterialPoints
 from gaussian_swaying.config.parser import option
 from gaussian_swaying.geometry.regions import Region
 
 POLE = {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [0.11, None, None]}}
 PIN = {"class_path": "PinnedRegion", "init_args": {"region": POLE}}
+ZERO = (0, 0, 0)
+in_both = pytest.mark.parametrize("formulation", ["total", "updated"])
 SMALL = {
     "scene.generator.init_args.spacing": 0.1,
     "scene.generator.init_args.overlap": 0.6,
@@ -64,6 +68,16 @@ def solid(position, volume, density=100.0, E=1e4, nu=0.3, **more):
     return MaterialPoints.create(position, volume=volume, density=density, youngs_modulus=E, poisson_ratio=nu, **more)
 
 
+def up_to(x=None, y=None, z=None):
+    """The places up to a limit along an axis."""
+    return Box([None] * 3, [x, y, z])
+
+
+def beyond(x=None, y=None, z=None):
+    """The places from a limit along an axis on."""
+    return Box([x, y, z], [None] * 3)
+
+
 class Chosen(Region):
     """Points by their number."""
 
@@ -75,19 +89,37 @@ class Chosen(Region):
         return self.mask.to(points.device)
 
 
+EYE = torch.eye(3, dtype=torch.float64)
+
+
 def double(values):
     """Numbers as a tensor of float64."""
     return torch.tensor(values, dtype=torch.float64)
 
 
+def seeded(seed):
+    """A generator of random numbers."""
+    return torch.Generator().manual_seed(seed)
+
+
+def rand(*shape, **options):
+    """Evenly distributed random numbers, in float64 unless told otherwise."""
+    return torch.rand(*shape, **{"dtype": torch.float64} | options)
+
+
+def randn(*shape, **options):
+    """Normally distributed random numbers, in float64 unless told otherwise."""
+    return torch.randn(*shape, **{"dtype": torch.float64} | options)
+
+
 def unit(*shape, **options):
     """Random unit vectors or quaternions, in float64 unless told otherwise."""
-    return torch.nn.functional.normalize(torch.randn(*shape, **{"dtype": torch.float64} | options), dim=-1)
+    return normalized(randn(*shape, **options))
 
 
 def gradients(count, device="cpu", dtype=torch.float64):
     """Deformation gradients of both orientations, none of them near singular."""
-    f = torch.eye(3, dtype=torch.float64) + 0.3 * torch.randn(count, 3, 3, dtype=torch.float64)
+    f = EYE + 0.3 * randn(count, 3, 3)
     f = f[torch.linalg.det(f).abs() > 0.2]
     assert len(f) > 4
     f[0] = torch.diag(torch.tensor([1.0, -1.0, 1.0]))
@@ -124,3 +156,46 @@ def refused(main, arguments, capsys, *words, folder=None):
         assert word in error, error
     assert (folder and contents(folder)) == before
     return error
+
+
+def normalized(vectors):
+    """Unit vectors of the same directions, along the last axis."""
+    return torch.nn.functional.normalize(vectors, dim=-1)
+
+
+def peak(values):
+    """The largest absolute value."""
+    return values.abs().max()
+
+
+def longest(vectors):
+    """The largest length of vectors along the last axis."""
+    return vectors.norm(dim=-1).max()
+
+
+def value_error(match):
+    """Expect a ValueError whose message matches."""
+    return pytest.raises(ValueError, match=match)
+
+
+def user_warning(match):
+    """Expect a UserWarning whose message matches."""
+    return pytest.warns(UserWarning, match=match)
+
+
+@contextmanager
+def silent():
+    """Where a warning is an error."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        yield
+
+
+def alike(found, expected, share):
+    """The two differ by no more than a share of what is expected."""
+    assert_close(found, expected, rtol=share, atol=0)
+
+
+def near(found, expected, within):
+    """The two differ by no more than an absolute bound."""
+    assert_close(found, expected, rtol=0, atol=within)

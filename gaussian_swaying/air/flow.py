@@ -28,7 +28,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying.geometry.linalg_triton import add3, dot3, load3, store3, where3
+from gaussian_swaying.geometry.linalg_triton import add3, chosen, dot3, load3, store3, where3
 from gaussian_swaying.kernels.derive import on_tensors
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.kernels.launch import lanes, launch
@@ -58,18 +58,10 @@ CPU_BLOCK = 16
 
 @triton.jit
 def _load_moments(moments, at, count, mask):
-    return (
-        tl.load(moments + at, mask, 0.0),
-        tl.load(moments + count + at, mask, 0.0),
-        tl.load(moments + 2 * count + at, mask, 0.0),
-        tl.load(moments + 3 * count + at, mask, 0.0),
-        tl.load(moments + 4 * count + at, mask, 0.0),
-        tl.load(moments + 5 * count + at, mask, 0.0),
-        tl.load(moments + 6 * count + at, mask, 0.0),
-        tl.load(moments + 7 * count + at, mask, 0.0),
-        tl.load(moments + 8 * count + at, mask, 0.0),
-        tl.load(moments + 9 * count + at, mask, 0.0),
-    )
+    found = ()
+    for q in tl.static_range(10):
+        found = found + (tl.load(moments + q * count + at, mask, 0.0),)
+    return found
 
 
 @triton.jit
@@ -239,7 +231,7 @@ def hold_faces(moments, held, behind, outward, wind, cells, count, BLOCK: tl.con
     near = _load_moments(moments, tl.load(behind + lane, mask, 0), count, mask)
     away = load3(outward, 1, 3 * lane, mask)
     blown = load3(wind, 1, 3 * lane, mask)
-    leaving = (near[1], near[2], near[3])
+    leaving = chosen(near, 1, 3)
     square = tl.where(mask, dot3(away, away), 1.0)
     out = dot3(blown, away) > 1e-6
     leaving = add3(leaving, -tl.minimum(dot3(leaving, away), 0.0) / square, away)

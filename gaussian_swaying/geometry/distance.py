@@ -12,7 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaussian_swaying.geometry.linalg_triton import chosen, dot3, matvec, transpose
+from gaussian_swaying.geometry.linalg import vectors
+from gaussian_swaying.geometry.linalg_triton import add3, chosen, dot3, matvec, scale3, transpose, where3
 from gaussian_swaying.kernels.derive import Memory, on_tensors
 from gaussian_swaying.kernels.language import tl, triton
 
@@ -25,10 +26,7 @@ def _outwards(x):
     """Length and direction of a vector; z for one without a direction."""
     length = tl.sqrt(dot3(x, x))
     some = length > LEAST
-    scale = 1 / tl.where(some, length, 1.0)
-    return length, (
-        tl.where(some, x[0] * scale, 0.0), tl.where(some, x[1] * scale, 0.0), tl.where(some, x[2] * scale, 1.0)
-    )  # fmt: skip
+    return length, where3(some, scale3(1 / tl.where(some, length, 1.0), x), (0.0, 0.0, 1.0))
 
 
 @triton.jit
@@ -44,11 +42,10 @@ def capsule_distance(x, numbers, table, mask, OPTIONS: tl.constexpr):
 
     ``numbers``: radius, half of the axis (3), one over the square of that.
     """
-    half = (numbers[1], numbers[2], numbers[3])
+    half = chosen(numbers, 1, 3)
     along = dot3(x, half) * numbers[4]
     along = tl.minimum(tl.maximum(along, -1.0), 1.0)
-    x = (x[0] - along * half[0], x[1] - along * half[1], x[2] - along * half[2])
-    return ball_distance(x, numbers, table, mask, OPTIONS)
+    return ball_distance(add3(x, -along, half), numbers, table, mask, OPTIONS)
 
 
 @triton.jit
@@ -72,8 +69,7 @@ def box_distance(x, numbers, table, mask, OPTIONS: tl.constexpr):
 @triton.jit
 def half_space_distance(x, numbers, table, mask, OPTIONS: tl.constexpr):
     """From a plane through the origin; ``numbers``: its normal."""
-    zero = x[0] * 0
-    return dot3(x, numbers), (numbers[0] + zero, numbers[1] + zero, numbers[2] + zero)
+    return dot3(x, numbers), add3(numbers, 0.0, x)
 
 
 @triton.jit
@@ -100,29 +96,21 @@ def grid_distance(x, numbers, table, mask, OPTIONS: tl.constexpr):
     x2, f2, o2 = _low((x[2] - numbers[2]) / spacing, nz)
     zero = f0 * 0
     distance, s0, s1, s2 = zero, zero, zero, zero
+    w0, w1 = (1 - f0, f0), (1 - f1, f1)
     for i in tl.static_range(2):
         for j in tl.static_range(2):
             line = ((x0 + i) * ny + x1 + j) * nz + x2
             low = tl.load(table + line, mask, 0.0)
             high = tl.load(table + line + 1, mask, 0.0)
-            if i == 0:
-                w0 = 1 - f0
-            else:
-                w0 = f0
-            if j == 0:
-                w1 = 1 - f1
-            else:
-                w1 = f1
             between = low + f2 * (high - low)
-            distance += w0 * w1 * between
-            s0 += (2 * i - 1) * w1 * between
-            s1 += (2 * j - 1) * w0 * between
-            s2 += w0 * w1 * (high - low)
+            distance += w0[i] * w1[j] * between
+            s0 += (2 * i - 1) * w1[j] * between
+            s1 += (2 * j - 1) * w0[i] * between
+            s2 += w0[i] * w1[j] * (high - low)
     far, away = _outwards((o0 * spacing, o1 * spacing, o2 * spacing))
     _length, n = _outwards((s0, s1, s2))
     out = far > 0
-    n = (tl.where(out, away[0], n[0]), tl.where(out, away[1], n[1]), tl.where(out, away[2], n[2]))
-    return distance + far, matvec(axes, n)
+    return distance + far, matvec(axes, where3(out, away, n))
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,4 +141,4 @@ def distance_at(function: Any, place: Tensor, numbers: Tensor, table: Tensor) ->
     """A device function of this file on tensors: distances (...) and unit gradients (..., 3) at places (..., 3)."""
     known = tuple(numbers.to(place).reshape(-1).unbind())
     distance, normal = on_tensors(function)(place.unbind(-1), known, Memory(table.to(place)), None, ())
-    return distance, torch.stack(torch.broadcast_tensors(*normal), -1)
+    return distance, vectors(normal)

@@ -43,9 +43,14 @@ def entries(matrix: Tensor) -> tuple[Tensor, ...]:
     return matrix.flatten(-2).unbind(-1)
 
 
+def vectors(parts: Sequence[Tensor]) -> Tensor:
+    """Vectors (..., n) of n numbers (...), as device functions return them."""
+    return torch.stack(torch.broadcast_tensors(*parts), -1)
+
+
 def matrix(entries: Sequence[Tensor]) -> Tensor:
     """Matrices (..., 3, 3) of nine entries (...)."""
-    return torch.stack(torch.broadcast_tensors(*entries), -1).unflatten(-1, (3, 3))
+    return vectors(entries).unflatten(-1, (3, 3))
 
 
 class _Polar(torch.autograd.Function):

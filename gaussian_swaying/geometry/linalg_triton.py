@@ -31,17 +31,10 @@ def store3(pointer, stride, index, value, mask):
 @triton.jit
 def load9(pointer, stride, index, mask):
     """Nine values, ``stride`` apart, from ``index`` on."""
-    return (
-        tl.load(pointer + index, mask, 0.0),
-        tl.load(pointer + stride + index, mask, 0.0),
-        tl.load(pointer + 2 * stride + index, mask, 0.0),
-        tl.load(pointer + 3 * stride + index, mask, 0.0),
-        tl.load(pointer + 4 * stride + index, mask, 0.0),
-        tl.load(pointer + 5 * stride + index, mask, 0.0),
-        tl.load(pointer + 6 * stride + index, mask, 0.0),
-        tl.load(pointer + 7 * stride + index, mask, 0.0),
-        tl.load(pointer + 8 * stride + index, mask, 0.0),
-    )
+    found = ()
+    for k in tl.static_range(9):
+        found = found + (tl.load(pointer + k * stride + index, mask, 0.0),)
+    return found
 
 
 @triton.jit
@@ -70,19 +63,16 @@ def store9(pointer, stride, index, value, mask):
 
 
 @triton.jit
+def rows(a):
+    """The three rows of a matrix."""
+    return chosen(a, 0, 3), chosen(a, 3, 3), chosen(a, 6, 3)
+
+
+@triton.jit
 def matmul(a, b):
     """A B."""
-    return (
-        a[0] * b[0] + a[1] * b[3] + a[2] * b[6],
-        a[0] * b[1] + a[1] * b[4] + a[2] * b[7],
-        a[0] * b[2] + a[1] * b[5] + a[2] * b[8],
-        a[3] * b[0] + a[4] * b[3] + a[5] * b[6],
-        a[3] * b[1] + a[4] * b[4] + a[5] * b[7],
-        a[3] * b[2] + a[4] * b[5] + a[5] * b[8],
-        a[6] * b[0] + a[7] * b[3] + a[8] * b[6],
-        a[6] * b[1] + a[7] * b[4] + a[8] * b[7],
-        a[6] * b[2] + a[7] * b[5] + a[8] * b[8],
-    )
+    x, y, z = rows(transpose(b))
+    return columns9(matvec(a, x), matvec(a, y), matvec(a, z))
 
 
 @triton.jit
@@ -94,61 +84,30 @@ def transpose(a):
 @triton.jit
 def matvec(m, x):
     """A matrix times a vector."""
-    return (
-        m[0] * x[0] + m[1] * x[1] + m[2] * x[2],
-        m[3] * x[0] + m[4] * x[1] + m[5] * x[2],
-        m[6] * x[0] + m[7] * x[1] + m[8] * x[2],
-    )
+    a, b, c = rows(m)
+    return dot3(a, x), dot3(b, x), dot3(c, x)
 
 
 @triton.jit
 def outer3(a, b):
     """A b^T of two vectors."""
-    return (
-        a[0] * b[0], a[0] * b[1], a[0] * b[2], a[1] * b[0], a[1] * b[1], a[1] * b[2],
-        a[2] * b[0], a[2] * b[1], a[2] * b[2],
-    )  # fmt: skip
+    return scale3(a[0], b) + scale3(a[1], b) + scale3(a[2], b)
 
 
 @triton.jit
 def cofactor(a):
     """The cofactor matrix."""
-    return (
-        a[4] * a[8] - a[5] * a[7],
-        a[5] * a[6] - a[3] * a[8],
-        a[3] * a[7] - a[4] * a[6],
-        a[7] * a[2] - a[8] * a[1],
-        a[8] * a[0] - a[6] * a[2],
-        a[6] * a[1] - a[7] * a[0],
-        a[1] * a[5] - a[2] * a[4],
-        a[2] * a[3] - a[0] * a[5],
-        a[0] * a[4] - a[1] * a[3],
-    )
-
-
-@triton.jit
-def cofactor_change(a, x):
-    """The derivative of the cofactor matrix in a direction X; as a form in X and a third matrix it is symmetric."""
-    return (
-        a[4] * x[8] + x[4] * a[8] - a[5] * x[7] - x[5] * a[7],
-        a[5] * x[6] + x[5] * a[6] - a[3] * x[8] - x[3] * a[8],
-        a[3] * x[7] + x[3] * a[7] - a[4] * x[6] - x[4] * a[6],
-        a[7] * x[2] + x[7] * a[2] - a[8] * x[1] - x[8] * a[1],
-        a[8] * x[0] + x[8] * a[0] - a[6] * x[2] - x[6] * a[2],
-        a[6] * x[1] + x[6] * a[1] - a[7] * x[0] - x[7] * a[0],
-        a[1] * x[5] + x[1] * a[5] - a[2] * x[4] - x[2] * a[4],
-        a[2] * x[3] + x[2] * a[3] - a[0] * x[5] - x[0] * a[5],
-        a[0] * x[4] + x[0] * a[4] - a[1] * x[3] - x[1] * a[3],
-    )
+    x, y, z = rows(a)
+    return cross3(y, z) + cross3(z, x) + cross3(x, y)
 
 
 @triton.jit
 def dot9(a, b):
     """Sum of the products of the entries of two matrices."""
-    return (
-        a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] + a[4] * b[4] + a[5] * b[5] + a[6] * b[6]
-        + a[7] * b[7] + a[8] * b[8]
-    )  # fmt: skip
+    found = a[0] * b[0]
+    for k in tl.static_range(1, 9):
+        found = found + a[k] * b[k]
+    return found
 
 
 @triton.jit
@@ -172,17 +131,19 @@ def scale3(s, a):
 @triton.jit
 def scale9(s, a):
     """S A."""
-    return (s * a[0], s * a[1], s * a[2], s * a[3], s * a[4], s * a[5], s * a[6], s * a[7], s * a[8])
+    found = ()
+    for k in tl.static_range(9):
+        found = found + (s * a[k],)
+    return found
 
 
 @triton.jit
 def axpy9(s, a, t, b):
     """S A + t B."""
-    return (
-        s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2],
-        s * a[3] + t * b[3], s * a[4] + t * b[4], s * a[5] + t * b[5],
-        s * a[6] + t * b[6], s * a[7] + t * b[7], s * a[8] + t * b[8],
-    )  # fmt: skip
+    found = ()
+    for k in tl.static_range(9):
+        found = found + (s * a[k] + t * b[k],)
+    return found
 
 
 @triton.jit
@@ -200,7 +161,7 @@ def add3(a, t, b):
 @triton.jit
 def columns9(a, b, c):
     """The matrix of three columns."""
-    return (a[0], b[0], c[0], a[1], b[1], c[1], a[2], b[2], c[2])
+    return transpose(a + b + c)
 
 
 @triton.jit
@@ -212,21 +173,19 @@ def where3(condition, a, b):
 @triton.jit
 def where9(condition, a, b):
     """Choose between matrices."""
-    return (
-        tl.where(condition, a[0], b[0]), tl.where(condition, a[1], b[1]), tl.where(condition, a[2], b[2]),
-        tl.where(condition, a[3], b[3]), tl.where(condition, a[4], b[4]), tl.where(condition, a[5], b[5]),
-        tl.where(condition, a[6], b[6]), tl.where(condition, a[7], b[7]), tl.where(condition, a[8], b[8]),
-    )  # fmt: skip
+    found = ()
+    for k in tl.static_range(9):
+        found = found + (tl.where(condition, a[k], b[k]),)
+    return found
 
 
 @triton.jit
 def scaled_product(u, d, v):
     """U diag(d) V^T."""
-    return matmul(
-        (u[0] * d[0], u[1] * d[1], u[2] * d[2], u[3] * d[0], u[4] * d[1], u[5] * d[2], u[6] * d[0], u[7] * d[1],
-         u[8] * d[2]),
-        transpose(v),
-    )  # fmt: skip
+    scaled = ()
+    for k in tl.static_range(9):
+        scaled = scaled + (u[k] * d[k % 3],)
+    return matmul(scaled, transpose(v))
 
 
 @triton.jit
@@ -281,10 +240,8 @@ def polar_change(F, R, x):
     turn = matmul(transpose(R), x)
     k = (turn[7] - turn[5], turn[2] - turn[6], turn[3] - turn[1])
     spin = scale3(scale, matvec(cof, k))
-    r0 = cross3((R[0], R[1], R[2]), spin)
-    r1 = cross3((R[3], R[4], R[5]), spin)
-    r2 = cross3((R[6], R[7], R[8]), spin)
-    return (r0[0], r0[1], r0[2], r1[0], r1[1], r1[2], r2[0], r2[1], r2[2])
+    a, b, c = rows(R)
+    return cross3(a, spin) + cross3(b, spin) + cross3(c, spin)
 
 
 @triton.jit
@@ -299,10 +256,7 @@ def _angle(app, aqq, apq):
 
 @triton.jit
 def _turn(c, s, a, b):
-    return (
-        (c * a[0] - s * b[0], c * a[1] - s * b[1], c * a[2] - s * b[2]),
-        (s * a[0] + c * b[0], s * a[1] + c * b[1], s * a[2] + c * b[2]),
-    )
+    return axpy3(c, a, -s, b), axpy3(s, a, c, b)
 
 
 @triton.jit
@@ -319,9 +273,9 @@ def _ordered(bp, bq, vp, vq):
     swap = dot3(bp, bp) < dot3(bq, bq)
     return (
         where3(swap, bq, bp),
-        where3(swap, (-bp[0], -bp[1], -bp[2]), bq),
+        where3(swap, scale3(-1.0, bp), bq),
         where3(swap, vq, vp),
-        where3(swap, (-vp[0], -vp[1], -vp[2]), vq),
+        where3(swap, scale3(-1.0, vp), vq),
     )
 
 
@@ -330,15 +284,13 @@ def _unit(vector, fallback):
     """A vector of length one; where it vanishes, the fallback."""
     squared = dot3(vector, vector)
     scale = 1.0 / tl.sqrt(tl.maximum(squared, 1e-31))
-    return where3(squared > 1e-31, (vector[0] * scale, vector[1] * scale, vector[2] * scale), fallback)
+    return where3(squared > 1e-31, scale3(scale, vector), fallback)
 
 
 @triton.jit
 def svd3(F):
     """U, signed stretches and V of F = U diag(a) V^T, U and V rotations, as ``linalg.spectrum``."""
-    c0 = (F[0], F[3], F[6])
-    c1 = (F[1], F[4], F[7])
-    c2 = (F[2], F[5], F[8])
+    c0, c1, c2 = rows(transpose(F))
     a00 = dot3(c0, c0)
     a11 = dot3(c1, c1)
     a22 = dot3(c2, c2)
@@ -365,9 +317,9 @@ def svd3(F):
         a11, a22, a12 = a11 - shift, a22 + shift, zero
         a01, a02 = c * a01 - s * a02, s * a01 + c * a02
         v1, v2 = _turn(c, s, v1, v2)
-    b0 = _combine(v0, c0, c1, c2)
-    b1 = _combine(v1, c0, c1, c2)
-    b2 = _combine(v2, c0, c1, c2)
+    b0 = matvec(F, v0)
+    b1 = matvec(F, v1)
+    b2 = matvec(F, v2)
     for _ in range(2):
         b0, b1, v0, v1 = _one_sided(b0, b1, v0, v1)
         b0, b2, v0, v2 = _one_sided(b0, b2, v0, v2)
@@ -382,24 +334,12 @@ def svd3(F):
     second = _unit(_reject(second, first), second)
     third = cross3(first, second)
     stretch = (dot3(first, b0), dot3(second, b1), dot3(third, b2))
-    left = (first[0], second[0], third[0], first[1], second[1], third[1], first[2], second[2], third[2])
-    axes = (v0[0], v1[0], v2[0], v0[1], v1[1], v2[1], v0[2], v1[2], v2[2])
-    return left, stretch, axes
-
-
-@triton.jit
-def _combine(v, c0, c1, c2):
-    return (
-        v[0] * c0[0] + v[1] * c1[0] + v[2] * c2[0],
-        v[0] * c0[1] + v[1] * c1[1] + v[2] * c2[1],
-        v[0] * c0[2] + v[1] * c1[2] + v[2] * c2[2],
-    )
+    return columns9(first, second, third), stretch, columns9(v0, v1, v2)
 
 
 @triton.jit
 def _reject(a, unit):
-    along = dot3(a, unit)
-    return (a[0] - along * unit[0], a[1] - along * unit[1], a[2] - along * unit[2])
+    return add3(a, -dot3(a, unit), unit)
 
 
 @triton.jit

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.geometry.covariances import deform_covariance
-from gaussian_swaying.geometry.linalg import polar_rotation
+from gaussian_swaying.geometry.linalg import entries, matrix, polar_rotation, vectors
 from gaussian_swaying.geometry.linalg_triton import (
     axpy9,
     cofactor,
@@ -154,8 +154,7 @@ def deform_normal(deformation_gradient: Tensor, normals: Tensor) -> Tensor:
     Returns:
         Shape (..., 3).
     """
-    found = on_tensors(deformed_normal)(components(deformation_gradient), normals.unbind(-1))
-    return torch.stack(torch.broadcast_tensors(*found), dim=-1)
+    return vectors(on_tensors(deformed_normal)(entries(deformation_gradient), normals.unbind(-1)))
 
 
 def deform_patch(deformation_gradient: Tensor, normals: Tensor, areas: Tensor) -> tuple[Tensor, Tensor]:
@@ -171,14 +170,9 @@ def deform_patch(deformation_gradient: Tensor, normals: Tensor, areas: Tensor) -
     Returns:
         Shapes (..., 3) and (...).
     """
-    given = components(deformation_gradient), normals.unbind(-1), areas
+    given = entries(deformation_gradient), normals.unbind(-1), areas
     normal, area = on_tensors(deformed_patch)(*given, math.inf)
-    return torch.stack(torch.broadcast_tensors(*normal), dim=-1), area
-
-
-def components(matrices: Tensor) -> tuple[Tensor, ...]:
-    """The nine numbers of matrices (..., 3, 3), as device functions take them."""
-    return matrices.reshape(*matrices.shape[:-2], 9).unbind(-1)
+    return vectors(normal), area
 
 
 def deform_all(
@@ -209,9 +203,7 @@ def deform_all(
     drawn = deform_covariance(deformation_gradient, covariances)
     turns = None if not rotations and max_stretch is None else polar_rotation(deformation_gradient)
     if max_stretch is not None and solid is not None and turns is not None:
-        given = (components(part) for part in (drawn, covariances, turns))
-        found = on_tensors(_limited)(*given, solid, max_stretch**2)
-        drawn = torch.stack(torch.broadcast_tensors(*found), dim=-1).reshape(drawn.shape)
+        drawn = matrix(on_tensors(_limited)(*map(entries, (drawn, covariances, turns)), solid, max_stretch**2))
     return drawn, deform_normal(deformation_gradient, normals), turns if rotations else None
 
 

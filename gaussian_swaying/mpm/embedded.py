@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.geometry.linalg_triton import load3, load9, matmul, store3, transpose
+from gaussian_swaying.geometry.linalg_triton import add3, load3, load9, matmul, matvec, store3, transpose
 from gaussian_swaying.geometry.patches import deform_and_store
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.kernels.launch import lanes, launch, replaces
@@ -36,30 +36,16 @@ def follow(
         node = tl.minimum(index, count - 1)
     else:
         node = tl.load(first + index, mask, 0)
-    f = (
-        tl.load(fraction + index, mask, 1.0),
-        tl.load(fraction + count + index, mask, 1.0),
-        tl.load(fraction + 2 * count + index, mask, 1.0),
-    )
+    f = load3(fraction, count, index, mask)
     wz, gz = axis_weights(f[2], inverse_dx)
     u, G, _v = gather_nodes(fields, node, sx, sy, f, wz, gz, inverse_dx, mask, False, table, count, VIRTUAL)
     if ARM:
-        a = load3(arm, 1, 3 * index, mask)
-        u = (
-            u[0] + G[0] * a[0] + G[1] * a[1] + G[2] * a[2],
-            u[1] + G[3] * a[0] + G[4] * a[1] + G[5] * a[2],
-            u[2] + G[6] * a[0] + G[7] * a[1] + G[8] * a[2],
-        )
+        u = add3(matvec(G, load3(arm, 1, 3 * index, mask)), 1.0, u)
     zero = 0 * index
     R = load9(axes, 1, zero, mask)
     F = matmul(matmul(transpose(R), G), R)  # zero at rest, so that nothing moves there
     F = (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1)
-    x = load3(means, 1, 3 * index, mask)
-    x = (
-        x[0] + per_metre * (R[0] * u[0] + R[3] * u[1] + R[6] * u[2]),
-        x[1] + per_metre * (R[1] * u[0] + R[4] * u[1] + R[7] * u[2]),
-        x[2] + per_metre * (R[2] * u[0] + R[5] * u[1] + R[8] * u[2]),
-    )
+    x = add3(load3(means, 1, 3 * index, mask), per_metre, matvec(transpose(R), u))
     store3(means_out, 1, 3 * index, x, mask)
     deform_and_store(
         F, covariance, normal, solid, covariance_out, normal_out, rotation_out, square, index, mask, TURN, LIMIT

@@ -9,7 +9,17 @@ from __future__ import annotations
 
 import math
 
-from gaussian_swaying.geometry.linalg_triton import clamp, dot3, load3, load9
+from gaussian_swaying.geometry.linalg_triton import (
+    add3,
+    clamp,
+    dot3,
+    load3,
+    load9,
+    matvec,
+    read,
+    scale3,
+    scale9,
+)
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.rendering.protocol import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, SLACK
 from gaussian_swaying.rendering.thinning import FEWEST, GOLDEN
@@ -35,14 +45,6 @@ def _doubles(values):
     found = ()
     for k in tl.static_range(len(values)):
         found = found + (values[k].to(tl.float64),)
-    return found
-
-
-@triton.jit
-def _times_each(values, factor):
-    found = ()
-    for k in tl.static_range(len(values)):
-        found = found + (values[k] * factor,)
     return found
 
 
@@ -81,9 +83,7 @@ def project(
         size += tl.abs(color[k]).to(tl.float64) + tl.abs(x[k])
     for k in tl.static_range(9):
         size += tl.abs(C[k])
-    right = (tl.load(camera) + zero, tl.load(camera + 1) + zero, tl.load(camera + 2) + zero)
-    down = (tl.load(camera + 4) + zero, tl.load(camera + 5) + zero, tl.load(camera + 6) + zero)
-    ahead = (tl.load(camera + 8) + zero, tl.load(camera + 9) + zero, tl.load(camera + 10) + zero)
+    right, down, ahead = read(camera, 0, 3), read(camera, 4, 3), read(camera, 8, 3)
     fx, cx = tl.load(camera + 16), tl.load(camera + 18)
     fy, cy = tl.load(camera + 20), tl.load(camera + 21)
     z = dot3(ahead, x) + tl.load(camera + 11)
@@ -104,7 +104,7 @@ def project(
     power = (1 / (share * grown)).to(tl.float32)
     covered = 1 - tl.exp(power * tl.log(tl.maximum(1 - tl.where(keep, opacity, 0.0), 1e-7)))
     opacity = tl.where(share < 1, covered, opacity)
-    C = _times_each(C, 1 / share)
+    C = scale9(1 / share, C)
     x_ratio = (dot3(right, x) + tl.load(camera + 3)) / depth
     y_ratio = (dot3(down, x) + tl.load(camera + 7)) / depth
     wide_x, wide_y = width.to(tl.float64), height.to(tl.float64)
@@ -112,18 +112,10 @@ def project(
     y_hat = clamp(y_ratio, (-cy - 0.15 * wide_y) / fy, (1.15 * wide_y - cy) / fy)
     across = fx / depth
     along = fy / depth
-    row_x = (
-        across * (right[0] - x_hat * ahead[0]),
-        across * (right[1] - x_hat * ahead[1]),
-        across * (right[2] - x_hat * ahead[2]),
-    )
-    row_y = (
-        along * (down[0] - y_hat * ahead[0]),
-        along * (down[1] - y_hat * ahead[1]),
-        along * (down[2] - y_hat * ahead[2]),
-    )
-    sigma_x = (dot3((C[0], C[1], C[2]), row_x), dot3((C[3], C[4], C[5]), row_x), dot3((C[6], C[7], C[8]), row_x))
-    sigma_y = (dot3((C[0], C[1], C[2]), row_y), dot3((C[3], C[4], C[5]), row_y), dot3((C[6], C[7], C[8]), row_y))
+    row_x = scale3(across, add3(right, -x_hat, ahead))
+    row_y = scale3(along, add3(down, -y_hat, ahead))
+    sigma_x = matvec(C, row_x)
+    sigma_y = matvec(C, row_y)
     xx = dot3(row_x, sigma_x) + tl.load(camera + 26)
     xy = dot3(row_x, sigma_y)
     yy = dot3(row_y, sigma_y) + tl.load(camera + 26)

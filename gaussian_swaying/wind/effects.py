@@ -18,7 +18,8 @@ from torch import Tensor, nn
 from gaussian_swaying._checks import check_positive, check_vector
 from gaussian_swaying._fixed import changed
 from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.geometry.linalg_triton import add3, chosen, cross3, dot3, matvec, scale3, transpose
+from gaussian_swaying.geometry.linalg import vectors
+from gaussian_swaying.geometry.linalg_triton import add3, chosen, cross3, dot3, matvec, scale3, transpose, where3
 from gaussian_swaying.kernels.derive import Memory, on_tensors
 from gaussian_swaying.kernels.graphs import Component
 from gaussian_swaying.kernels.language import tl, triton
@@ -33,7 +34,7 @@ def log_profile(v, x, numbers, now, table, OPTIONS: tl.constexpr):
     """``LogProfile``; ``numbers``: height of the ground, roughness, one over the logarithm."""
     above = tl.maximum(x[2] - numbers[0], numbers[1])
     factor = tl.log(above / numbers[1]) * numbers[2]
-    return v[0] * factor, v[1] * factor, v[2] * factor
+    return scale3(factor, v)
 
 
 @triton.jit
@@ -42,7 +43,7 @@ def power_profile(v, x, numbers, now, table, OPTIONS: tl.constexpr):
     above = (x[2] - numbers[0]) * numbers[1]
     factor = tl.exp(numbers[2] * tl.log(tl.where(above > 0, above, 1.0)))
     factor = tl.where(above > 0, factor, 0.0)
-    return v[0] * factor, v[1] * factor, v[2] * factor
+    return scale3(factor, v)
 
 
 @triton.jit
@@ -126,7 +127,7 @@ def blown(device_function: DeviceFunction, velocity: Tensor, position: Tensor, m
     found = on_tensors(device_function.function)(
         air, place, numbers(device_function.numbers.take()), numbers(now), table, device_function.options
     )
-    return torch.stack(torch.broadcast_tensors(*found), dim=-1)
+    return vectors(found)
 
 
 def placed(frame: SimFrame, point: Sequence[float]) -> list[float]:
@@ -265,12 +266,7 @@ def _direction(flow):
     """Unit vector of a flow, zero in still air, and its speed."""
     speed = tl.sqrt(dot3(flow, flow))
     scale = 1 / tl.maximum(speed, 1e-12)
-    return (flow[0] * scale, flow[1] * scale, flow[2] * scale), speed
-
-
-@triton.jit
-def _only(where, v):
-    return tl.where(where, v[0], 0.0), tl.where(where, v[1], 0.0), tl.where(where, v[2], 0.0)
+    return scale3(scale, flow), speed
 
 
 @triton.jit
@@ -321,7 +317,7 @@ def past_cylinder(v, x, numbers, now, table, OPTIONS: tl.constexpr):
     ``numbers``: middle (3), axis (3), radius, drag; ``now``: the mean flow. ``OPTIONS``: whether it has a wake.
     """
     radius = numbers[6]
-    axis = (numbers[3], numbers[4], numbers[5])
+    axis = chosen(numbers, 3, 3)
     p = add3(x, -1.0, numbers)
     height = dot3(p, axis)
     away = add3(p, -height, axis)
@@ -333,7 +329,7 @@ def past_cylinder(v, x, numbers, now, table, OPTIONS: tl.constexpr):
     along = 2 * dot3(across, away) / square
     share = radius * radius / square
     v = add3(v, share, add3(across, -along, away))
-    v = _only(outside, v)
+    v = where3(outside, v, (0.0, 0.0, 0.0))
     if OPTIONS[0]:
         rising = dot3(now, axis)
         direction, _ = _direction(add3(now, -rising, axis))
@@ -399,7 +395,7 @@ def past_ellipsoid(v, x, numbers, now, table, OPTIONS: tl.constexpr):
     w = matvec(axes, v)
     a = (r[0] * r[0], r[1] * r[1], r[2] * r[2])
     outside = q[0] * q[0] / a[0] + q[1] * q[1] / a[1] + q[2] * q[2] / a[2] >= 1
-    q = (tl.where(outside, q[0], r[0]), tl.where(outside, q[1], r[1]), tl.where(outside, q[2], r[2]))
+    q = where3(outside, q, r)
     # left of the root, so that Newton rises to it: every part of the sum is at most 1, and the longest half axis is 1
     sides = tl.maximum(tl.maximum(q[0] * q[0] - a[0], q[1] * q[1] - a[1]), q[2] * q[2] - a[2])
     root = tl.maximum(tl.maximum(sides, dot3(q, q) - 1), 0.0)
@@ -418,7 +414,7 @@ def past_ellipsoid(v, x, numbers, now, table, OPTIONS: tl.constexpr):
         w[1] + strong[1] * third_of * carlson_rd(s[2], s[0], s[1], OPTIONS[2]) + steep * n[1],
         w[2] + strong[2] * third_of * carlson_rd(s[0], s[1], s[2], OPTIONS[2]) + steep * n[2],
     )
-    v = matvec(transpose(axes), _only(outside, w))
+    v = matvec(transpose(axes), where3(outside, w, (0.0, 0.0, 0.0)))
     if OPTIONS[0]:
         direction, _speed = _direction(now)
         flat = tl.maximum(tl.sqrt(direction[0] * direction[0] + direction[1] * direction[1]), 1e-12)

@@ -26,6 +26,7 @@ from gaussian_swaying._checks import (
 from gaussian_swaying._fixed import Fixed, FixedList, changed, fixed
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.keyed_path import picked
+from gaussian_swaying.geometry.linalg import vectors
 from gaussian_swaying.geometry.linalg_triton import add3, load3, scale3, store3
 from gaussian_swaying.kernels.derive import on_tensors
 from gaussian_swaying.kernels.graphs import Component
@@ -151,7 +152,7 @@ class Modulation(Component, nn.Module, ABC):
         """
         numbers = tuple(getattr(self, name) for name in self.numbers)
         given = velocity.unbind(-1), time, numbers, stream_start(seed, stream, velocity.device)
-        return torch.stack(torch.broadcast_tensors(*on_tensors(self.function)(*given)), dim=-1)
+        return vectors(on_tensors(self.function)(*given))
 
 
 class SineSway(Modulation):
@@ -530,11 +531,10 @@ class WindField(Fixed, nn.Module):
             own = [getattr(part, name) for name in part.numbers]  # type: ignore[union-attr]
             rows += [torch.as_tensor(value, dtype=torch.float64, device=device) for value in (own + [0.0])[:3]]
             starts.append(stream_start(self.seed, stream, device))
-        count = len(self.modulations)
-        many = torch.broadcast_tensors(*rows, starts[0])[0].reshape(-1).shape
-        return torch.stack([row.expand(many) for row in rows], -1).reshape(-1, count, 3), torch.stack(
-            [start.expand(many) for start in starts], -1
-        )
+        count = len(starts)
+        found = torch.broadcast_tensors(*rows, *starts)
+        numbers, first = torch.stack(found[:-count], -1), torch.stack(found[-count:], -1)
+        return numbers.reshape(-1, count, 3), first.reshape(-1, count)
 
     def modulated(self, velocity: Tensor, time: Tensor) -> Tensor:
         """Velocities (..., 3) at times (...) with all modulations, in one kernel; in torch they take some seventy."""

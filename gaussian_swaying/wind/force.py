@@ -24,6 +24,7 @@ from gaussian_swaying._checks import (
 from gaussian_swaying._devices import in_double
 from gaussian_swaying._fixed import Fixed, FixedList, changed
 from gaussian_swaying.geometry.groups import sums
+from gaussian_swaying.geometry.linalg import entries, vectors
 from gaussian_swaying.geometry.linalg_triton import (
     add3,
     axpy3,
@@ -39,7 +40,7 @@ from gaussian_swaying.geometry.linalg_triton import (
     scale3,
     transpose,
 )
-from gaussian_swaying.geometry.patches import components, deformed_patch
+from gaussian_swaying.geometry.patches import deformed_patch
 from gaussian_swaying.kernels.derive import device_function, gradient, on_tensors, primitive
 from gaussian_swaying.kernels.graphs import tensors_in
 from gaussian_swaying.kernels.language import tl, triton
@@ -114,7 +115,7 @@ def force_on_patch(F, velocity, patch, numbers, air, table, LAW: tl.constexpr):
 
     ``numbers``: as for :func:`patch_force`, and the largest ratio of areas.
     """
-    normal, area = deformed_patch(F, (patch[0], patch[1], patch[2]), patch[3], numbers[4])
+    normal, area = deformed_patch(F, chosen(patch, 0, 3), patch[3], numbers[4])
     return patch_force(air, velocity, normal, area, numbers, LAW), area
 
 
@@ -129,7 +130,7 @@ def _changed_wind(m: tl.constexpr, EFFECTS: tl.constexpr, v, position, now, tabl
 @triton.jit
 def shaped_wind(position, now, table, EFFECTS: tl.constexpr):
     """``WindField.shaped``: the wind with its effects, of which ``now`` has the velocity without them first."""
-    v = (now[0], now[1], now[2])
+    v = chosen(now, 0, 3)
     if len(EFFECTS.functions) > 0:
         zero = position[0] * 0
         v = (v[0] + zero, v[1] + zero, v[2] + zero)
@@ -147,10 +148,10 @@ def add_direction(s, q, b, w, LAW: tl.constexpr):
     """
     along = dot3(b, w)
     sign = tl.where(along < 0, -1.0, 1.0)
-    s = (s[0] + sign * b[0], s[1] + sign * b[1], s[2] + sign * b[2])
+    s = add3(s, sign, b)
     if LAW == 3:
         flow = sign * along * along / tl.maximum(dot3(b, b), 1.2e-38)
-        q = (q[0] + flow * b[0], q[1] + flow * b[1], q[2] + flow * b[2])
+        q = add3(q, flow, b)
     return s, q
 
 
@@ -163,27 +164,19 @@ def sums_over_patches(table, place, w, LAW: tl.constexpr):
     first = 4 * place[0].to(tl.int32)
     count = place[1].to(tl.int32)
     real = count > 0
-    t0 = tl.load(table + first, real, 0.0)
-    t1 = tl.load(table + first + 1, real, 0.0)
-    t2 = tl.load(table + first + 2, real, 0.0)
-    t3 = tl.load(table + first + 3, real, 0.0)
-    t4 = tl.load(table + first + 4, real, 0.0)
-    t5 = tl.load(table + first + 5, real, 0.0)
-    tensor = (t0, t1, t2, t1, t3, t4, t2, t4, t5)
-    rest = t0 + t3 + t5
+    t = load3(table, 1, first, real) + load3(table, 1, first + 3, real)
+    tensor = (t[0], t[1], t[2], t[1], t[3], t[4], t[2], t[4], t[5])
+    rest = t[0] + t[3] + t[5]
     zero = rest * 0
     s = (zero, zero, zero)
     q = (zero, zero, zero)
     for k in range(0, tl.max(count), 4):  # four rows at once
         row = first + 8 + 4 * k
-        b0 = load3(table, 1, row, k < count)
-        b1 = load3(table, 1, row + 4, k + 1 < count)
-        b2 = load3(table, 1, row + 8, k + 2 < count)
-        b3 = load3(table, 1, row + 12, k + 3 < count)
-        s, q = add_direction(s, q, b0, w, LAW)
-        s, q = add_direction(s, q, b1, w, LAW)
-        s, q = add_direction(s, q, b2, w, LAW)
-        s, q = add_direction(s, q, b3, w, LAW)
+        b = ()
+        for j in tl.static_range(4):
+            b = b + (load3(table, 1, row + 4 * j, k + j < count),)  # type: ignore[assignment]
+        for j in tl.static_range(4):
+            s, q = add_direction(s, q, b[j], w, LAW)
     return tensor, rest, s, q
 
 
@@ -204,11 +197,11 @@ def flow_adjoint(table, place, w, by_q):
 
 def _sums(patches: PatchSums, place: Any, w: tuple[Tensor, ...], LAW: int) -> Any:
     """:func:`sums_over_patches` of tensors (P,)."""
-    b, point, count = patches.vector, patches.point, len(patches.tensor)
-    along = (b * torch.stack(torch.broadcast_tensors(*w), dim=-1)[point]).sum(-1, keepdim=True)
-    s = sums(torch.where(along < 0, -1.0, 1.0) * b, point, count).unbind(-1)
-    flow = along * along.abs() / b.square().sum(-1, keepdim=True)
-    return components(patches.tensor), patches.area, s, sums(flow * b, point, count).unbind(-1) if LAW == 3 else s
+    point, count, zero = patches.point, len(patches.tensor), (0.0, 0.0, 0.0)
+    own = tuple(part.expand(count)[point] for part in w)
+    terms = on_tensors(add_direction)(zero, zero, patches.vector.unbind(-1), own, LAW)
+    found = [sums(torch.stack(term, -1), point, count).unbind(-1) for term in (terms if LAW == 3 else terms[:1])]
+    return entries(patches.tensor), patches.area, found[0], found[-1]
 
 
 def _sums_adjoint(given: Any, result: Any, bars: Any) -> Any:
@@ -336,7 +329,7 @@ def aero_force(
     check_shape("wind", wind, 3)
     numbers = tuple(part.to(velocity) if isinstance(part, Tensor) else part for part in (drag, friction, lift))
     given = wind.to(velocity).unbind(-1), velocity.unbind(-1), normal.unbind(-1), area, (*numbers, 0.5 * air_density)
-    return torch.stack(torch.broadcast_tensors(*on_tensors(patch_force)(*given, LAWS.index(law))), dim=-1)
+    return vectors(on_tensors(patch_force)(*given, LAWS.index(law)))
 
 
 def added_mass_per_area(breadth: float, air_density: float) -> float:
@@ -519,10 +512,10 @@ class AeroForce(Fixed, nn.Module):
         groups = isinstance(patches, PatchSums)
         point = (0.0, 0.0) if isinstance(patches, PatchSums) else (*patches[0].unbind(-1), patches[1])
         force, area = on_tensors(force_on_group if groups else force_on_patch)(
-            components(deformation_gradient), velocity.unbind(-1), point, self.numbers().to(velocity).unbind(),
+            entries(deformation_gradient), velocity.unbind(-1), point, self.numbers().to(velocity).unbind(),
             wind.to(velocity).unbind(-1), patches if groups else None, LAWS.index(self.law),
         )  # fmt: skip
-        return torch.stack(torch.broadcast_tensors(*force), dim=-1), area
+        return vectors(force), area
 
 
 @triton.jit

@@ -56,21 +56,11 @@ def look_up(table, sizes, place, OPTIONS: tl.constexpr):
     mz = sizes[2].to(tl.int32)
     zero = fx * 0
     a, b, c = zero, zero, zero
+    xs, ys, wx, wy = (x0, x1), (y0, y1), (1 - fx, fx), (1 - fy, fy)
     for i in tl.static_range(2):
         for j in tl.static_range(2):
-            if i == 0:
-                x = x0
-                wx = 1 - fx
-            else:
-                x = x1
-                wx = fx
-            if j == 0:
-                y = y0
-                w = wx * (1 - fy)
-            else:
-                y = y1
-                w = wx * fy
-            line = (x * my + y) * mz
+            w = wx[i] * wy[j]
+            line = (xs[i] * my + ys[j]) * mz
             low = table + (line + z0) * OPTIONS[3]
             high = table + (line + z1) * OPTIONS[3]
             w0 = w * (1 - fz)

@@ -5,7 +5,7 @@ The problems are those of tools/bench/problems/air.py; the bench records finer o
 
 import pytest
 import torch
-from shared import double
+from shared import EYE, alike, double, near, peak, randn, seeded, value_error
 from torch.testing import assert_close
 
 from gaussian_swaying.air import flow as kernels
@@ -25,7 +25,7 @@ BOXES = {
 
 @pytest.fixture
 def moments():
-    return 0.05 * torch.randn(10, 50, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    return 0.05 * randn(10, 50, generator=seeded(0))
 
 
 def _populations(moments):
@@ -34,7 +34,7 @@ def _populations(moments):
 
 def _collided(moments, relaxation=0.8, smagorinsky=0.0, push=(0.0, 0.0, 0.0)):
     """The sums of the populations, and the moments after a collision."""
-    sums = (torch.zeros(50, dtype=torch.float64),) * 10
+    sums = (torch.zeros(50).double(),) * 10
     for c, f in zip(DIRECTIONS, _populations(moments), strict=True):
         sums = on_tensors(kernels.gather)(sums, f, *c)
     return torch.stack(sums), torch.stack(on_tensors(kernels.collide)(sums, relaxation, smagorinsky, *push))
@@ -42,12 +42,11 @@ def _collided(moments, relaxation=0.8, smagorinsky=0.0, push=(0.0, 0.0, 0.0)):
 
 def test_moments_of_the_weights_are_those_of_a_gas_at_rest():
     """Up to the fourth: sums of w c c = I / 3, and of w c c c c = (I I) / 9, without which viscosity has directions."""
-    eye = torch.eye(3, dtype=torch.float64)
     assert_close(W.sum(), double(1.0))
-    assert_close(torch.einsum("i,ia,ib->ab", W, C, C), eye / 3)
-    fourth = sum(torch.einsum(f"{a},{b}->abcd", eye, eye) for a, b in (("ab", "cd"), ("ac", "bd"), ("ad", "bc")))
+    assert_close(torch.einsum("i,ia,ib->ab", W, C, C), EYE / 3)
+    fourth = sum(torch.einsum(f"{a},{b}->abcd", EYE, EYE) for a, b in (("ab", "cd"), ("ac", "bd"), ("ad", "bc")))
     assert_close(torch.einsum("i,ia,ib,ic,id->abcd", W, C, C, C, C), fourth / 9)
-    assert_close(torch.einsum("i,ia,ib,ic->abc", W, C, C, C), torch.zeros(3, 3, 3, dtype=torch.float64))
+    assert_close(torch.einsum("i,ia,ib,ic->abc", W, C, C, C), torch.zeros(3, 3, 3).double())
 
 
 def test_populations_have_the_moments_that_made_them_and_third_ones_by_recursion(moments):
@@ -104,14 +103,14 @@ def test_air_that_is_too_dense_goes_to_all_neighbours(cell):
 
 def _random(flow, seed=0):
     """A flow that differs from cell to cell, with moving walls, and a wind that blows in and out."""
-    draw = torch.Generator().manual_seed(seed)
-    velocity = torch.randn(3, *flow.cells, dtype=torch.float64, generator=draw)
-    walls = 0.1 * torch.randn(3, *flow.cells, dtype=torch.float64, generator=draw)
+    draw = seeded(seed)
+    velocity = randn(3, *flow.cells, generator=draw)
+    walls = 0.1 * randn(3, *flow.cells, generator=draw)
     moments = flow.start(velocity, walls, dtype=torch.float64).moments
-    other = torch.randn(7, *flow.cells, dtype=torch.float64, generator=draw) * (flow.kind != WALL)
+    other = randn(7, *flow.cells, generator=draw) * (flow.kind != WALL)
     moments[0] += 0.01 * other[0]
     moments[4:] += 0.001 * other[1:]
-    return FlowState(moments), torch.randn(len(flow.held), 3, dtype=torch.float64, generator=draw)
+    return FlowState(moments), randn(len(flow.held), 3, generator=draw)
 
 
 def _ball(place):
@@ -125,7 +124,7 @@ def _ball(place):
 def test_a_step_of_float32_is_that_of_float64(name, walls, kernel_device):
     """With interpolated bounce-back at a ball."""
     cells, faces = BOXES[name]
-    solid = {"some": torch.rand(cells, generator=torch.Generator().manual_seed(1)) < 0.05, "ball": _ball}.get(walls)
+    solid = {"some": torch.rand(cells, generator=seeded(1)) < 0.05, "ball": _ball}.get(walls)
     flow = LatticeFlow(cells, UNITS, faces=faces, walls=solid)
     if walls == "ball":
         assert flow.gaps.min() < 0.2
@@ -134,7 +133,7 @@ def test_a_step_of_float32_is_that_of_float64(name, walls, kernel_device):
     push = (0.1, 0.2, 0.3)
     expected = flow.step(state, wind, push).moments
     single = flow.to(kernel_device).step(FlowState(state.moments.float().to(kernel_device)), wind, push).moments
-    assert_close(single.cpu().double(), expected, rtol=0, atol=5e-7 if walls == "ball" else 3e-7)
+    near(single.cpu().double(), expected, 5e-7 if walls == "ball" else 3e-7)
 
 
 def test_nothing_flows_back_in_where_the_wind_blows_out():
@@ -146,8 +145,8 @@ def test_nothing_flows_back_in_where_the_wind_blows_out():
     before, after = (given[1:4].reshape(3, -1).T for given in (state.moments, moments))
     across = flow.outward / flow.outward.norm(dim=-1, keepdim=True)
     came, left = ((part[index.long()] * across).sum(-1) for part, index in ((before, flow.behind), (after, flow.held)))
-    assert int((came < 0).sum()) > 20
-    assert_close(left, came.clamp(min=0).to(left), rtol=0, atol=1e-12)
+    assert (came < 0).sum() > 20
+    near(left, came.clamp(min=0).to(left), 1e-12)
 
 
 @pytest.mark.parametrize("shift", [0.3, 0.8])
@@ -160,7 +159,7 @@ def test_a_wall_between_cells_is_where_it_is(shift):
         return (place[..., 2] < low) | (place[..., 2] > high)
 
     flow = LatticeFlow((4, 1, cells + 2), units, faces=("periodic",) * 3, walls=inside, smagorinsky=0)
-    height = torch.arange(cells + 2, dtype=torch.float64) + 0.5
+    height = torch.arange(cells + 2).double() + 0.5
     exact = ((height - low) * (high - height)).clamp(min=0) / 36
     start = torch.zeros(3, *flow.cells)
     start[0] = exact
@@ -168,7 +167,7 @@ def test_a_wall_between_cells_is_where_it_is(shift):
     for _ in range(600):
         state = flow.step(state, acceleration=(push, 0.0, 0.0))
     found = (flow.velocity(state)[0, 0, 0] - 0.5 * push * units.dt).double() * (flow.kind[0, 0] == 0)
-    assert_close(found, exact * (flow.kind[0, 0] == 0), rtol=0, atol=0.01)
+    near(found, exact * (flow.kind[0, 0] == 0), 0.01)
 
 
 def test_mass_and_momentum_of_a_periodic_box_stay():
@@ -197,9 +196,9 @@ def test_wind_blows_through_an_open_box_undisturbed():
     for _ in range(60):
         state = flow.step(state, torch.tensor([0.8, 0.3, -0.2]))
     expected = torch.tensor([0.8, 0.3, -0.2])[:, None, None, None].expand(3, 12, 8, 8)
-    assert_close(flow.velocity(state), expected, rtol=0, atol=1e-5)
+    near(flow.velocity(state), expected, 1e-5)
     pressure = state.moments[0] * (UNITS.density * UNITS.speed**2 / 3)
-    assert pressure.abs().max() < 1e-4
+    assert peak(pressure) < 1e-4
 
 
 def test_a_new_wind_fills_the_box():
@@ -207,14 +206,14 @@ def test_a_new_wind_fills_the_box():
     state = flow.start([0.5, 0.0, 0.0])
     for _ in range(400):
         state = flow.step(state, torch.tensor([1.0, 0.0, 0.0]))
-    assert_close(flow.velocity(state)[0].mean(), torch.tensor(1.0), rtol=0.02, atol=0)
+    alike(flow.velocity(state)[0].mean(), torch.tensor(1.0), 0.02)
 
 
 def test_vorticity_of_a_turning_flow():
     flow = LatticeFlow((8, 7, 6), UNITS)
-    axes = [0.1 * torch.arange(n, dtype=torch.float64) for n in flow.cells]
+    axes = [0.1 * torch.arange(n).double() for n in flow.cells]
     place = torch.stack(torch.meshgrid(*axes, indexing="ij"))
-    spin = torch.tensor([0.2, -0.3, 0.5], dtype=torch.float64)
+    spin = double([0.2, -0.3, 0.5])
     turning = torch.linalg.cross(spin[:, None, None, None].expand_as(place), place, dim=0)
     found = flow.vorticity(flow.start(turning, dtype=torch.float64))
     assert_close(found, 2 * spin[:, None, None, None].expand_as(found))
@@ -232,5 +231,5 @@ def test_kinds_of_cells():
 
 @pytest.mark.parametrize(("cells", "message"), [((3, 8, 8), "at least 4"), ((2000, 2000, 2000), "at most")])
 def test_bad_numbers_of_cells(cells, message):
-    with pytest.raises(ValueError, match=message):
+    with value_error(message):
         LatticeFlow(cells, UNITS)

@@ -10,6 +10,7 @@ import pytest
 import torch
 from PIL import Image
 from plyfile import PlyData, PlyElement
+from shared import double, longest, peak, user_warning, value_error
 from small_captures import POINTS, arc, picture, write_colmap, write_transforms
 from torch.testing import assert_close
 
@@ -61,7 +62,7 @@ def test_one_transforms_file(tmp_path):
         assert torch.equal(view.load(), torch.from_numpy(picture(index)))
     train = torch.stack([pose.position for pose in poses[1:8]])
     assert_close(capture.center, train.mean(0).float())
-    assert capture.extent == pytest.approx(1.1 * float((train - train.mean(0)).norm(dim=-1).max()), rel=1e-5)
+    assert capture.extent == pytest.approx(1.1 * float(longest(train - train.mean(0))), rel=1e-5)
     assert capture.points is None
     assert len(read_capture(tmp_path / "transforms.json", test_every=3).split("test")) == 3
     assert read_capture(tmp_path, test_every=0).split("test") == ()
@@ -104,7 +105,7 @@ def test_frames_without_an_image_are_counted_once(tmp_path, written):
     for index in (1, 4):
         (tmp_path / f"images/{index:03d}.png").unlink()
     message = r"left out 2 of 6 cameras that have no photo on disk, the first of them that of images/001\.png\."
-    with pytest.warns(UserWarning, match=message) as caught:
+    with user_warning(message) as caught:
         capture = read_capture(tmp_path)
     assert len(caught) == 1
     assert [view.name[-7:-4] for view in capture.views] == ["000", "002", "003", "005"]
@@ -185,7 +186,7 @@ def test_colmap_camera_models(tmp_path, binary, model, parameters, expected):
 def test_other_camera_models_are_refused(tmp_path, binary):
     fisheye = [19.0, 18.0, 9.5, 8.25, 0.1, -0.02, 0.003, 0.004]
     write_colmap(tmp_path, arc(2), ["a.png", "b.png"], "OPENCV_FISHEYE", fisheye, binary)
-    with pytest.raises(ValueError, match=r"cameras\.(bin|txt).*camera 7.*OPENCV_FISHEYE.*image_undistorter"):
+    with value_error(r"cameras\.(bin|txt).*camera 7.*OPENCV_FISHEYE.*image_undistorter"):
         read_capture(tmp_path)
 
 
@@ -194,7 +195,7 @@ def test_colmap_comes_before_transforms_unless_told(tmp_path):
     write_colmap(tmp_path, poses, ["000.png", "001.png", "002.png"])
     write_transforms(tmp_path, poses[:2], _names(2))
     assert len(read_capture(tmp_path).views) == 3
-    with pytest.warns(UserWarning, match=r"left out 1 of 3 photos.*no camera in transforms\.json.*002\.png"):
+    with user_warning(r"left out 1 of 3 photos.*no camera in transforms\.json.*002\.png"):
         assert len(read_capture(tmp_path, "transforms", test_every=0).views) == 2
 
 
@@ -214,7 +215,7 @@ def test_the_model_with_most_images_is_read(tmp_path, models, read, found):
         write_colmap(tmp_path, arc(count), names[:count], sparse=sparse, images=False)
     write_transforms(tmp_path, arc(6), names)
     (tmp_path / "images/000_depth_1.png").write_bytes(b"made of 000.png")
-    with pytest.warns(UserWarning, match=f"left out {6 - read} of 6 photos") if read < 6 else nullcontext():
+    with user_warning(f"left out {6 - read} of 6 photos") if read < 6 else nullcontext():
         capture = read_capture(tmp_path, test_every=0)
     assert len(capture.views) == len(read_views(tmp_path)) == read
     assert found in capture.found
@@ -268,7 +269,7 @@ def test_photos_are_turned_as_their_cameras_are(tmp_path, orientation, size, tol
     points = []
     for pose, pixels in zip(poses, files, strict=True):
         for row, column in ((2, 3), (4, 12), (13, 5)):
-            ray = torch.tensor([column + 0.5, row + 0.5, 1.0], dtype=torch.float64) @ pose.intrinsics.inverse().T
+            ray = double([column + 0.5, row + 0.5, 1.0]) @ pose.intrinsics.inverse().T
             place = pose.world_to_camera[:3, :3].T @ (0.05 * ray - pose.world_to_camera[:3, 3])
             points.append((place.tolist(), pixels[row, column].tolist()))
     write_colmap(tmp_path, poses, names, points=points, images=False)
@@ -279,7 +280,7 @@ def test_photos_are_turned_as_their_cameras_are(tmp_path, orientation, size, tol
     )
     (tmp_path / "sparse/0/points3D.bin").unlink()
     sure = size[0] != size[1] and orientation >= 5
-    with nullcontext() if sure else pytest.warns(UserWarning, match="3 photos have an EXIF tag.*remove the tag"):
+    with nullcontext() if sure else user_warning("3 photos have an EXIF tag.*remove the tag"):
         views = read_capture(tmp_path, test_every=0).views
     assert [view.turned for view in views] == [told and sure] * 3
 
@@ -291,7 +292,7 @@ def test_masks_are_alpha(tmp_path, white, written):
     mask[:, :10] = white
     (tmp_path / "masks").mkdir()
     Image.fromarray(mask).save(tmp_path / "masks/all.png")
-    with pytest.warns(UserWarning, match="not used are the masks in .*masks: name them.*`mask_path`"):
+    with user_warning("not used are the masks in .*masks: name them.*`mask_path`"):
         read_capture(tmp_path)
     _edit(tmp_path, lambda d: [frame.update(mask_path=".\\masks\\ALL.jpg") for frame in d["frames"]])
     capture = read_capture(tmp_path)
@@ -302,16 +303,16 @@ def test_masks_are_alpha(tmp_path, white, written):
     assert loaded[:, 10:].unique().tolist() == [0]
     assert read_capture(tmp_path, downscale=2).views[1].load().shape == (8, 10, 4)
     Image.fromarray(mask[:8]).save(tmp_path / "masks/all.png")
-    with pytest.raises(ValueError, match=r"mask .*all\.png has 20 x 8 pixels.*proportions of the photo"):
+    with value_error(r"mask .*all\.png has 20 x 8 pixels.*proportions of the photo"):
         capture.views[1].load()
     (tmp_path / "masks/all.png").unlink()
-    with pytest.raises(ValueError, match=r"masks/ALL\.jpg does not exist"):
+    with value_error(r"masks/ALL\.jpg does not exist"):
         read_capture(tmp_path)
 
 
 # ---- map coordinates
 
-FAR_AWAY = torch.tensor([500123.25, 4649776.5, 312.0], dtype=torch.float64)
+FAR_AWAY = double([500123.25, 4649776.5, 312.0])
 
 
 @pytest.mark.parametrize("kind", ["bin", "txt", "transforms"])
@@ -333,8 +334,8 @@ def test_map_coordinates_keep_their_detail(tmp_path, kind):
         views.append(read_views(folder, origin=captures[-1].origin))
     near, far = captures
     assert near.origin == NO_ORIGIN
-    shift = (torch.tensor(far.origin, dtype=torch.float64) - FAR_AWAY).float()
-    assert float(shift.abs().max()) < 4
+    shift = (double(far.origin) - FAR_AWAY).float()
+    assert peak(shift) < 4
     assert_close(far.points, near.points - shift, rtol=0, atol=1e-6)
     assert far.extent == pytest.approx(near.extent, rel=1e-6)
     for a, b, (_, c) in zip(near.views, far.views, views[1], strict=True):
@@ -357,25 +358,25 @@ def test_axes_of_opencv(tmp_path, written):
     written()
     expected = [view.camera.world_to_camera for view in read_capture(tmp_path).views]
     _edit(tmp_path, _opencv)
-    with pytest.warns(UserWarning, match="optical axes meet behind.*set `axes` of the transforms.json to opencv"):
+    with user_warning("optical axes meet behind.*set `axes` of the transforms.json to opencv"):
         capture = read_capture(tmp_path)
-    with pytest.raises(ValueError, match=r"look at no common point.*set `axes`"):
+    with value_error(r"look at no common point.*set `axes`"):
         initial_points(capture)
     write_points(tmp_path / "points3d.ply", [(0, 0.125, 0.25)])
-    with pytest.raises(ValueError, match=r"Only 0 of 3 cameras .* see any of its points: y and z.*set `axes`"):
+    with value_error(r"Only 0 of 3 cameras .* see any of its points: y and z.*set `axes`"):
         read_capture(tmp_path)
     _edit(tmp_path, lambda data: data.update(axes="opencv"))
     for view, (_, other), pose in zip(read_capture(tmp_path).views, read_views(tmp_path), expected, strict=True):
         assert_close(view.camera.world_to_camera, pose)
         assert_close(other.world_to_camera, pose)
     _edit(tmp_path, lambda data: data.update(axes="OpenCV"))
-    with pytest.raises(ValueError, match=r"`axes`.*'OpenCV': set it to opengl or opencv"):
+    with value_error(r"`axes`.*'OpenCV': set it to opengl or opencv"):
         read_capture(tmp_path)
 
 
 def test_points_of_something_else(tmp_path):
     write_colmap(tmp_path, arc(3), ["a.png", "b.png", "c.png"], points=[((0.0, 0.0, 5000.0), (1, 2, 3))])
-    with pytest.raises(ValueError, match=r"Only 0 of 3 cameras .* not of the same reconstruction.*remove the points"):
+    with value_error(r"Only 0 of 3 cameras .* not of the same reconstruction.*remove the points"):
         read_capture(tmp_path)
 
 
@@ -406,7 +407,7 @@ def test_downscale_averages_or_reads_the_smaller_folder(tmp_path, kind):
     assert float(view.camera.intrinsics[0, 0]) == pytest.approx(focal * 7 / 20)
     assert read_capture(tmp_path).views[1].camera.width == 20
     iio.imwrite(tmp_path / "images_3" / names[0], np.zeros((9, 7, 3), dtype=np.uint8))
-    with pytest.raises(ValueError, match=r"images_3/000\.png has 7 x 9 pixels.*remove the folder"):
+    with value_error(r"images_3/000\.png has 7 x 9 pixels.*remove the folder"):
         read_capture(tmp_path, downscale=3)
 
 
@@ -454,34 +455,34 @@ def _mirror(data):
 def test_bad_transforms_are_named(tmp_path, change, message, written):
     written()
     _edit(tmp_path, change)
-    with pytest.raises(ValueError, match=message):
+    with value_error(message):
         read_capture(tmp_path)
 
 
 def test_an_unreadable_image_is_named_before_anything_is_loaded(tmp_path, written):
     written()
     (tmp_path / "images/001.png").write_text("no image")
-    with pytest.raises(ValueError, match=r"images/001\.png cannot be read"):
+    with value_error(r"images/001\.png cannot be read"):
         read_capture(tmp_path)
 
 
 def test_an_empty_split_and_bad_arguments(tmp_path, written):
     written()
-    with pytest.raises(ValueError, match=r"train split.*empty.*set it to 0"):
+    with value_error(r"train split.*empty.*set it to 0"):
         read_capture(tmp_path, test_every=1)
     for name, value in (("downscale", 0), ("downscale", 1.5), ("test_every", -1)):
-        with pytest.raises(ValueError, match=f"`{name}`"):
+        with value_error(f"`{name}`"):
             read_capture(tmp_path, **{name: value})
-    with pytest.raises(ValueError, match="lower `downscale`"):
+    with value_error("lower `downscale`"):
         read_capture(tmp_path, downscale=17)
-    with pytest.raises(ValueError, match="`format`"):
+    with value_error("`format`"):
         read_capture(tmp_path, format="nerf")
     with pytest.raises(FileNotFoundError, match="check the path"):
         read_capture(tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(ValueError, match=r"not a capture.*sparse.*transforms\.json"):
+    with value_error(r"not a capture.*sparse.*transforms\.json"):
         read_capture(tmp_path / "empty")
-    with pytest.raises(ValueError, match="no sparse/0 or sparse"):
+    with value_error("no sparse/0 or sparse"):
         read_capture(tmp_path, "colmap")
 
 
@@ -494,20 +495,20 @@ def test_bad_colmap_models_are_named(tmp_path, binary):
     suffix = "bin" if binary else "txt"
     folder = write()
     (folder / f"sparse/0/cameras.{suffix}").unlink()
-    with pytest.raises(ValueError, match="Cannot read cameras of the COLMAP model"):
+    with value_error("Cannot read cameras of the COLMAP model"):
         read_capture(folder)
     for name in ("cameras", "images", "points3D"):
         folder = write()
         file = folder / f"sparse/0/{name}.{suffix}"
         data = file.read_bytes()
         file.write_bytes(data[:-9] if binary else data + b"8 OPENCV x\n")
-        with pytest.raises(ValueError, match=rf"{name}\.{suffix} is damaged.*export the model again"):
+        with value_error(rf"{name}\.{suffix} is damaged.*export the model again"):
             read_capture(folder)
     folder = write(images=False)
     (folder / "images").mkdir()
-    with pytest.raises(ValueError, match=r"all 3 are missing, the first of them a\.png"):
+    with value_error(r"all 3 are missing, the first of them a\.png"):
         read_capture(folder)
-    with pytest.raises(ValueError, match=r"no folder photos/.*`images` to one of images, sparse\."):
+    with value_error(r"no folder photos/.*`images` to one of images, sparse\."):
         read_capture(write(), images="photos")
 
 
@@ -522,7 +523,7 @@ def test_one_photo_with_two_cameras(tmp_path):
     write_colmap(tmp_path, arc(3), names)
     for name in names[:2]:
         (tmp_path / "images" / name).unlink()
-    with pytest.raises(ValueError, match=r"cameras of 0\.png and left/0\.png .* the same photo .*correct the names"):
+    with value_error(r"cameras of 0\.png and left/0\.png .* the same photo .*correct the names"):
         read_capture(tmp_path)
 
 
@@ -532,10 +533,10 @@ def test_a_zero_quaternion_and_an_unknown_camera_are_named(tmp_path):
     good = file.read_text()
     words = good.splitlines()[1].split()
     file.write_text(good.replace(" ".join(words[1:5]), "0 0 0 0"))
-    with pytest.raises(ValueError, match=r"image a\.png.*not rigid"):
+    with value_error(r"image a\.png.*not rigid"):
         read_capture(tmp_path)
     file.write_text(good.replace("7 a.png", "3 a.png"))
-    with pytest.raises(ValueError, match=r"image a\.png.*names camera 3"):
+    with value_error(r"image a\.png.*names camera 3"):
         read_capture(tmp_path)
 
 

@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from shared import double
+from shared import EYE, double, near, value_error
 from small_captures import write_colmap, write_transforms
 from torch.testing import assert_close
 
@@ -13,7 +13,7 @@ from gaussian_swaying.captures.capture_camera import CaptureCamera, read_views
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera, TransformsCamera
 
-CENTER, UP = torch.zeros(3, dtype=torch.float64), double([0.0, 0.0, 1.0])
+CENTER, UP = torch.zeros(3).double(), double([0.0, 0.0, 1.0])
 ANGLES = {"a.png": 0.0, "b.png": 0.25 * math.pi, "c.png": 0.5 * math.pi}
 
 
@@ -36,7 +36,7 @@ def capture(request, tmp_path):
 
 
 def _same(camera, expected):
-    assert_close(camera.world_to_camera, expected.world_to_camera, rtol=0, atol=1e-5)
+    near(camera.world_to_camera, expected.world_to_camera, 1e-5)
     assert_close(camera.intrinsics, expected.intrinsics, rtol=1e-6, atol=1e-4)
     assert (camera.width, camera.height) == (expected.width, expected.height)
 
@@ -56,7 +56,7 @@ def test_a_journey_meets_every_view_in_the_order_of_names(capture):
     _same(path(0, 99.0, CENTER, UP, 1.0), _cameras()["c.png"])
     between = path(0, 1.0, CENTER, UP, 1.0)
     rotation = between.world_to_camera[:3, :3]
-    assert_close(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-5)
+    near(rotation @ rotation.T, EYE, 1e-5)
     seen = between.world_to_camera[:3] @ double([0.0, 0.0, 0.0, 1.0])
     assert abs(float(seen[0] / seen[2])) < 0.05  # it still looks about where both neighbours look
     assert 2.5 < between.position[:2].norm() < 3.0
@@ -69,13 +69,13 @@ def test_the_picture_can_have_another_size(capture):
 
 
 def test_bad_views(capture, tmp_path):
-    with pytest.raises(ValueError, match="no view 3: set `view` between 0 and 2"):
+    with value_error("no view 3: set `view` between 0 and 2"):
         CaptureCamera(capture, view=3)(0, 0.0, CENTER, UP, 1.0)
-    with pytest.raises(ValueError, match=r"no view `d`, or several: .* such as images/a\.png"):
+    with value_error(r"no view `d`, or several: .* such as images/a\.png"):
         CaptureCamera(capture, view="d")(0, 0.0, CENTER, UP, 1.0)
     empty = tmp_path / "empty"
     empty.mkdir()
-    with pytest.raises(ValueError, match=r"has no cameras: give a transforms\.json"):
+    with value_error(r"has no cameras: give a transforms\.json"):
         CaptureCamera(empty)(0, 0.0, CENTER, UP, 1.0)
 
 
@@ -85,7 +85,7 @@ def test_views_of_different_sizes_need_one(tmp_path):
         for name, w in (("a", 64), ("b", 32))
     ]
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
-    with pytest.raises(ValueError, match="2 different sizes"):
+    with value_error("2 different sizes"):
         CaptureCamera(tmp_path)(0, 0.0, CENTER, UP, 1.0)
     assert CaptureCamera(tmp_path, width=16, height=16)(0, 0.0, CENTER, UP, 1.0).width == 16
 
@@ -99,7 +99,7 @@ def test_places_that_count_from_an_origin(capture):
     for path in paths:
         before = path(0, 0.0, CENTER, UP, 1.0).position
         after = path.counted_from(origin)(0, 0.0, CENTER, UP, 1.0).position
-        assert_close(after, before - double(origin), rtol=0, atol=2e-4)  # float32
+        near(after, before - double(origin), 2e-4)  # float32
         assert path(0, 0.0, CENTER, UP, 1.0).position.equal(before)
     orbit = OrbitCamera()
     assert orbit.counted_from(origin) is orbit

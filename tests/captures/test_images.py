@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from shared import value_error
 
 from gaussian_swaying.captures.images import image_size, load_image, read_image, straight_colors
 from gaussian_swaying.captures.lens import Lens
@@ -78,22 +79,22 @@ def test_an_undistorted_image_has_the_size_of_its_lens(tmp_path, pixels):
 
 
 def test_bad_images_are_named(tmp_path, pixels):
-    with pytest.raises(ValueError, match=r"none\.png does not exist"):
+    with value_error(r"none\.png does not exist"):
         read_image(tmp_path / "none.png")
     (tmp_path / "text.png").write_text("not a picture")
     for function in (read_image, image_size):
-        with pytest.raises(ValueError, match=r"text\.png cannot be read.*copy it again"):
+        with value_error(r"text\.png cannot be read.*copy it again"):
             function(tmp_path / "text.png")
     iio.imwrite(tmp_path / "cut.png", np.random.default_rng(0).integers(0, 256, (64, 64, 3), dtype=np.uint8))
     data = (tmp_path / "cut.png").read_bytes()
     (tmp_path / "cut.png").write_bytes(data[: len(data) // 2])
-    with pytest.raises(ValueError, match=r"cut\.png cannot be read"):
+    with value_error(r"cut\.png cannot be read"):
         read_image(tmp_path / "cut.png")
     iio.imwrite(tmp_path / "a.png", pixels)
-    with pytest.raises(ValueError, match=r"a\.png has 9 x 6 pixels, but its camera has 8 x 6"):
+    with value_error(r"a\.png has 9 x 6 pixels, but its camera has 8 x 6"):
         load_image(tmp_path / "a.png", _plain(8, 6))
     Image.fromarray(np.zeros((4, 4), dtype=np.float32)).save(tmp_path / "float.tiff")
-    with pytest.raises(ValueError, match=r"float\.tiff has floating-point numbers"):
+    with value_error(r"float\.tiff has floating-point numbers"):
         read_image(tmp_path / "float.tiff")
 
 
@@ -101,5 +102,5 @@ def test_bad_images_are_named(tmp_path, pixels):
 def test_a_pipe_keeps_nobody_waiting(tmp_path):
     os.mkfifo(tmp_path / "a.png")
     for read in (image_size, read_image):
-        with pytest.raises(ValueError, match=r"a\.png is not a regular file"):
+        with value_error(r"a\.png is not a regular file"):
             read(tmp_path / "a.png")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 from plyfile import PlyData, PlyElement
+from shared import alike, near, peak, user_warning, value_error
 from small_captures import arc, write_colmap, write_transforms
-from torch.testing import assert_close
 
 from gaussian_swaying.captures.capture import read_capture
 from gaussian_swaying.captures.generated_capture import GeneratedCapture
@@ -35,13 +35,13 @@ def test_random_points_fill_what_the_cameras_see(capture):
     cloud = initial_points(capture, "auto", count=20_000, seed=3)
     reach = 2.0 * 10 / 8 * np.tan(np.radians(25))
     middle = 0.5 * (cloud.points.amax(0) + cloud.points.amin(0))
-    assert_close(middle, torch.tensor([0.0, 0.0, 0.2]), rtol=0, atol=0.01)
-    assert_close(cloud.points.amax(0) - middle, torch.full((3,), reach).float(), rtol=0.02, atol=0)
+    near(middle, torch.tensor([0.0, 0.0, 0.2]), 0.01)
+    alike(cloud.points.amax(0) - middle, torch.full((3,), reach).float(), 0.02)
     assert 0 <= cloud.colors.min() < 0.01 < 0.99 < cloud.colors.max() <= 1
     assert torch.equal(initial_points(capture, count=20_000, seed=3).points, cloud.points)
     assert not torch.equal(initial_points(capture, count=20_000, seed=4).points, cloud.points)
     small = initial_points(capture, half_side=0.1, count=100)
-    assert (small.points - torch.tensor([0.0, 0.0, 0.2])).abs().max() <= 0.1 + 1e-6
+    assert peak(small.points - torch.tensor([0.0, 0.0, 0.2])) <= 0.1 + 1e-6
 
 
 def test_random_points_keep_away_from_the_cameras(capture):
@@ -53,12 +53,12 @@ def test_random_points_keep_away_from_the_cameras(capture):
     ratio = torch.cdist(cloud.points, eyes) / (eyes - middle).norm(dim=-1)
     assert 0.5 <= ratio.min() < 0.53
     reach = (cloud.points - middle).abs().amax(0)
-    assert_close(reach, torch.full((3,), 4.0), rtol=0.01, atol=0)
+    alike(reach, torch.full((3,), 4.0), 0.01)
 
 
 def test_random_points_without_room(capture, monkeypatch):
     monkeypatch.setattr("gaussian_swaying.captures.initial_points._ATTEMPTS", 1)
-    with pytest.raises(ValueError, match="leave no room"):
+    with value_error("leave no room"):
         initial_points(capture, "random", count=1000, half_side=4.0)
 
 
@@ -78,10 +78,10 @@ def test_consistent_points_lie_where_the_photos_agree(tmp_path):
     assert off_black.any()
     assert typical(chosen.points[off_black]) < 0.5 * typical(around.points)
     cause = "in fewer than three of the 21 training photos.*cameras overlap too little.*`point_count`"
-    with pytest.raises(ValueError, match=cause):
+    with value_error(cause):
         consistent_points(capture, 400, half_side=1e3)
     few = replace(capture, views=capture.split("train")[:2])
-    with pytest.raises(ValueError, match=r"100% are in fewer than three of the 2 .*too few photos \(`test_every`\)"):
+    with value_error(r"100% are in fewer than three of the 2 .*too few photos \(`test_every`\)"):
         consistent_points(few, 400)
 
 
@@ -92,10 +92,10 @@ def test_a_mesh_is_sampled_by_area(tmp_path, capture):
     upright = cloud.points[:, 2] > 4
     assert float(upright.float().mean()) == pytest.approx(0.25 / 2.25, abs=0.01)
     flat = cloud.points[~upright]
-    assert flat[:, 2].abs().max() == 0
+    assert peak(flat[:, 2]) == 0
     counts = torch.histogramdd(flat[:, :2], [4, 2], range=[0.0, 2.0, 0.0, 1.0]).hist
-    assert_close(counts / len(flat), torch.full((4, 2), 1 / 8), rtol=0.06, atol=0)
-    assert_close(cloud.colors[~upright][:, 2], flat[:, 1], rtol=0, atol=1e-5)  # red below, blue above
+    alike(counts / len(flat), torch.full((4, 2), 1 / 8), 0.06)
+    near(cloud.colors[~upright][:, 2], flat[:, 1], 1e-5)  # red below, blue above
     assert cloud.normals[~upright][0].tolist() == [0, 0, 1]
     assert cloud.normals[upright][0].tolist() == [0, -1, 0]
 
@@ -114,27 +114,27 @@ def test_ply_with_and_without_faces(tmp_path, capture):
 
 
 def test_bad_sources_are_named(tmp_path, capture):
-    with pytest.raises(ValueError, match="has no points"):
+    with value_error("has no points"):
         initial_points(capture, "capture")
-    with pytest.raises(ValueError, match=r"points\.xyz.*\.ply or \.obj"):
+    with value_error(r"points\.xyz.*\.ply or \.obj"):
         initial_points(capture, "points.xyz")
     for name in ("none.ply", "none.obj"):
-        with pytest.raises(ValueError, match=rf"{name}.*check the path"):
+        with value_error(rf"{name}.*check the path"):
             initial_points(capture, tmp_path / name)
     (tmp_path / "text.ply").write_text("hello")
-    with pytest.raises(ValueError, match=r"text\.ply is not a \.ply"):
+    with value_error(r"text\.ply is not a \.ply"):
         initial_points(capture, tmp_path / "text.ply")
     (tmp_path / "bad.obj").write_text(SQUARE + "f 1 2 9\n")
-    with pytest.raises(ValueError, match=r"bad\.obj has no faces, or faces of vertices that do not exist"):
+    with value_error(r"bad\.obj has no faces, or faces of vertices that do not exist"):
         read_obj_mesh(tmp_path / "bad.obj")
     (tmp_path / "nan.obj").write_text("v nan 0 0\nf 1 1 1\n")
-    with pytest.raises(ValueError, match=r"nan\.obj.*NaN"):
+    with value_error(r"nan\.obj.*NaN"):
         read_obj_mesh(tmp_path / "nan.obj")
-    with pytest.raises(ValueError, match="degenerate"):
+    with value_error("degenerate"):
         sample_mesh(PointCloud(torch.zeros(3, 3), torch.zeros(3, 3)), torch.tensor([[0, 1, 2]]), 5)
-    with pytest.raises(ValueError, match="`count`"):
+    with value_error("`count`"):
         initial_points(capture, count=0)
-    with pytest.raises(ValueError, match="`half_side`"):
+    with value_error("`half_side`"):
         random_points(torch.zeros(3), 0.0, 5)
 
 
@@ -144,7 +144,7 @@ def test_cameras_that_look_apart_need_points(tmp_path):
     eyes = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)]
     outward = [look_at_camera(eye, [2 * v for v in eye], (0, 0, 1), 40.0, 20, 16, dtype=torch.float64) for eye in eyes]
     folder = write_transforms(tmp_path, outward, [f"{i}.png" for i in range(4)])
-    with pytest.warns(UserWarning, match="axes meet behind the cameras"):
+    with user_warning("axes meet behind the cameras"):
         capture = read_capture(folder, test_every=0)
-    with pytest.raises(ValueError, match="look at no common point, but away from one"):
+    with value_error("look at no common point, but away from one"):
         initial_points(capture)

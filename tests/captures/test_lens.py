@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch.testing import assert_close
+from shared import double, near, rand, value_error
 
 from gaussian_swaying.captures.lens import Lens, distort, remap, undistort
 
@@ -19,7 +19,7 @@ def _lens(distortion, width=90, height=60):
 
 def test_distortion_of_a_point_by_hand():
     """x = (0.5, -0.2): r2 = 0.29, radial = 1 + 0.1 r2 + 0.2 r2^2 + 0.3 r2^3."""
-    seen = distort(torch.tensor([0.5, -0.2], dtype=torch.float64), (0.1, 0.2, 0.01, 0.02, 0.3))
+    seen = distort(double([0.5, -0.2]), (0.1, 0.2, 0.01, 0.02, 0.3))
     radial = 1 + 0.1 * 0.29 + 0.2 * 0.29**2 + 0.3 * 0.29**3
     x = 0.5 * radial + 2 * 0.01 * 0.5 * -0.2 + 0.02 * (0.29 + 2 * 0.25)
     y = -0.2 * radial + 0.01 * (0.29 + 2 * 0.04) + 2 * 0.02 * 0.5 * -0.2
@@ -29,8 +29,8 @@ def test_distortion_of_a_point_by_hand():
 @pytest.mark.parametrize("distortion", [FOX, BARREL, PINCUSHION])
 def test_the_undistorted_picture_is_that_of_a_pinhole(distortion):
     """The scene is a plane at depth 1 whose brightness is linear in place: no interpolation error to hide behind."""
-    points = 1.2 * torch.rand(500, 2, dtype=torch.float64) - 0.6
-    assert_close(undistort(distort(points, distortion), distortion), points, rtol=0, atol=1e-10)
+    points = 1.2 * rand(500, 2) - 0.6
+    near(undistort(distort(points, distortion), distortion), points, 1e-10)
     lens = _lens(distortion)
     columns, rows = torch.arange(90) + 0.5, torch.arange(60) + 0.5
     v, u = torch.meshgrid((rows - lens.cy) / lens.fy, (columns - lens.cx) / lens.fx, indexing="ij")
@@ -42,7 +42,7 @@ def test_the_undistorted_picture_is_that_of_a_pinhole(distortion):
     y = (torch.arange(target.height) + 0.5 - target.cy) / target.fy
     gy, gx = torch.meshgrid(y, x, indexing="ij")
     expected = torch.stack([gx, gy - 2 * gx]).double()
-    assert_close(remap(image, lens, target), expected, rtol=0, atol=2e-4)
+    near(remap(image, lens, target), expected, 2e-4)
     assert (expected[0, 0, 1] - expected[0, 0, 0]).abs() > 1e-2  # a pixel off would show
 
 
@@ -69,8 +69,8 @@ def test_the_undistorted_picture_is_the_largest_that_is_covered(distortion):
 def test_no_distortion_changes_nothing():
     lens = _lens((0.0,) * 5)
     assert lens.undistorted() is lens
-    image = torch.rand(3, 60, 90, dtype=torch.float64)
-    assert_close(remap(image, lens, lens), image, rtol=0, atol=1e-12)
+    image = rand(3, 60, 90)
+    near(remap(image, lens, lens), image, 1e-12)
 
 
 def test_smaller_lenses_see_the_same_rays():
@@ -86,11 +86,11 @@ def test_smaller_lenses_see_the_same_rays():
 
 
 def test_bad_lenses():
-    with pytest.raises(ValueError, match="folds the image"):
+    with value_error("folds the image"):
         _lens((-2.0, 0.0, 0.0, 0.0, 0.0)).undistorted()
-    with pytest.raises(ValueError, match="`fx` of a lens"):
+    with value_error("`fx` of a lens"):
         Lens(0.0, 1.0, 0.0, 0.0, 4, 4)
-    with pytest.raises(ValueError, match="distortion"):
+    with value_error("distortion"):
         _lens((0.0, float("nan"), 0.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match="lower `downscale`"):
+    with value_error("lower `downscale`"):
         _lens((0.0,) * 5).averaged(61)

@@ -1,6 +1,7 @@
 """Names of photos in the files of a capture mean the photos that people have on disk."""
 
 import pytest
+from shared import value_error
 
 from gaussian_swaying.captures.photos import Photos
 
@@ -54,5 +55,5 @@ def test_a_name_that_fits_several_photos_is_refused(tmp_path):
     for file in ("a.png", "A.JPG"):
         (tmp_path / file).write_bytes(b"")
     assert Photos(tmp_path).find("a.png") == tmp_path / "a.png"
-    with pytest.raises(ValueError, match=r"name a of a photo fits 2 files.*rename or remove all but one"):
+    with value_error(r"name a of a photo fits 2 files.*rename or remove all but one"):
         Photos(tmp_path).find("a")

@@ -7,6 +7,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from shared import value_error
 from torch import Tensor, nn
 
 from gaussian_swaying.evaluation.compare import compare_run, evaluate, table
@@ -120,7 +121,7 @@ def test_the_frame_that_a_run_writes_is_understood(compared):
     frame = SimFrame.fit(torch.tensor([[0.0, 1.5, 2.5], [2.0, 2.5, 3.5]]), metres_per_unit=1.0)
     place = {"origin": frame.origin.tolist(), "rotation": frame.rotation.tolist(), "metres_per_unit": 1.0}
     assert compared({"sim_frame": place})["mean"]["chamfer_m"] < 0.02
-    with pytest.raises(ValueError, match="has no `sim_frame`: run the simulation again"):
+    with value_error("has no `sim_frame`: run the simulation again"):
         compared({"name": "other", "sim_frame": None}, {"name": "another"})
 
 
@@ -214,17 +215,17 @@ def test_nothing_is_left_of_a_comparison_that_fails(make_run, make_reference, tm
     run, reference = make_run(), make_reference()
     path = run / "frames/00002.png"
     path.write_bytes(path.read_bytes()[:120])  # the header says the right size
-    with pytest.raises(ValueError, match=r"00002\.png cannot be read"):
+    with value_error(r"00002\.png cannot be read"):
         evaluate(run, reference, tmp_path / "a/b")
     assert not (tmp_path / "a").exists()
-    with pytest.raises(ValueError, match=r"The run folder .*nowhere does not exist"):
+    with value_error(r"The run folder .*nowhere does not exist"):
         evaluate(tmp_path / "nowhere", reference, tmp_path / "nowhere/eval")
     assert not (tmp_path / "nowhere").exists()
 
 
 def test_an_output_that_is_a_file(make_run, make_reference, tmp_path):
     (tmp_path / "taken").write_text("")
-    with pytest.raises(ValueError, match=r"output folder .*taken cannot be written .* --output"):
+    with value_error(r"output folder .*taken cannot be written .* --output"):
         evaluate(make_run(), make_reference(), tmp_path / "taken")
 
 
@@ -282,39 +283,39 @@ def _nan(folder):
 def test_a_bad_run(make_run, make_reference, spoil, message):
     run = make_run()
     spoil(run)
-    with pytest.raises(ValueError, match=message):
+    with value_error(message):
         compare_run(run, make_reference(), points=100)
 
 
 def test_numbers_of_frames_that_differ(make_run, make_reference):
     run, reference = make_run(frames=4), make_reference(frames=6)
     message = r"differ: there are 4 pictures in .*run and 6 in .*reference, .*surfaces.* with --frames 4"
-    with pytest.raises(ValueError, match=message):
+    with value_error(message):
         compare_run(run, reference)
     assert compare_run(run, reference, frames=4, points=100)["frames"] == 4
-    with pytest.raises(ValueError, match="only 4 frames can be compared: lower --frames"):
+    with value_error("only 4 frames can be compared: lower --frames"):
         compare_run(run, reference, frames=5)
-    with pytest.raises(ValueError, match=r"nothing is left beginning with .* correct --reference-offset"):
+    with value_error(r"nothing is left beginning with .* correct --reference-offset"):
         compare_run(run, reference, reference_offset=6)
 
 
 def test_nothing_to_compare(make_run, make_reference, tmp_path):
     run = make_run()
-    with pytest.raises(ValueError, match=r"The reference folder .*nowhere does not exist"):
+    with value_error(r"The reference folder .*nowhere does not exist"):
         compare_run(run, tmp_path / "nowhere")
-    with pytest.raises(ValueError, match=r"Nothing can be compared \(pictures: .*; surface: there is no .*cloth\.npz"):
+    with value_error(r"Nothing can be compared \(pictures: .*; surface: there is no .*cloth\.npz"):
         compare_run(run, make_reference(cloth=False, pictures=False))
 
 
 def test_fvd_without_what_it_needs(make_run, make_reference, network):
     run = make_run()
-    with pytest.raises(ValueError, match="needs pictures"):
+    with value_error("needs pictures"):
         compare_run(run, make_reference(pictures=False), fvd=network)
-    with pytest.raises(ValueError, match="Two clips of 2 frames need 3 frames, but 2 are compared"):
+    with value_error("Two clips of 2 frames need 3 frames, but 2 are compared"):
         compare_run(run, make_reference("other"), frames=2, fvd=network)
 
 
 @pytest.mark.parametrize("option", ["points", "frames", "side"])
 def test_bad_options(compared, option):
-    with pytest.raises(ValueError, match=f"Expected `{option}` to be positive"):
+    with value_error(f"Expected `{option}` to be positive"):
         compared(**{option: 0})

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from shared import value_error
 
 from gaussian_swaying.evaluation.reference import read_cloth
 
@@ -34,17 +35,17 @@ def test_squares_are_halved_and_the_side_may_be_in_the_settings(make_reference):
     ],
 )
 def test_a_bad_cloth(make_reference, arrays, message):
-    with pytest.raises(ValueError, match=message):
+    with value_error(message):
         read_cloth(make_reference(**arrays) / "cloth.npz")
 
 
 def test_a_damaged_or_incomplete_cloth(tmp_path):
     path = tmp_path / "cloth.npz"
-    with pytest.raises(ValueError, match=r"cloth\.npz does not exist"):
+    with value_error(r"cloth\.npz does not exist"):
         read_cloth(path)
     path.write_bytes(b"PK")
-    with pytest.raises(ValueError, match=r"cloth\.npz is not a .npz file"):
+    with value_error(r"cloth\.npz is not a .npz file"):
         read_cloth(path)
     np.savez(path, positions=np.zeros((2, 3, 3)))
-    with pytest.raises(ValueError, match="has no array `faces`"):
+    with value_error("has no array `faces`"):
         read_cloth(path)

@@ -10,6 +10,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from shared import value_error
 
 from gaussian_swaying.evaluation.sway import contact_sheet, space_time, sway_score
 
@@ -111,7 +112,7 @@ def test_what_stands_still_has_no_score(rest):
     ],
 )
 def test_input_that_does_not_fit(rest, frames, times, says):
-    with pytest.raises(ValueError, match=says):
+    with value_error(says):
         sway_score(rest, bent(rest, x=0.1 * sine(1))[:frames], times)
 
 
@@ -140,13 +141,13 @@ def test_one_line_of_pixels_over_time():
 
 
 def test_pictures_that_do_not_fit():
-    with pytest.raises(ValueError, match="at least one picture"):
+    with value_error("at least one picture"):
         contact_sheet([], 3)
-    with pytest.raises(ValueError, match="`columns` of at least 1, but got 0"):
+    with value_error("`columns` of at least 1, but got 0"):
         contact_sheet(film(2), 0)
-    with pytest.raises(ValueError, match="but got float64"):
+    with value_error("but got float64"):
         space_time(film(2) / 255, row=0)
-    with pytest.raises(ValueError, match="`row` from 0 to 3, but got 4"):
+    with value_error("`row` from 0 to 3, but got 4"):
         space_time(film(2), row=4)
 
 

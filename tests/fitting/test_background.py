@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from handheld_films import tripod, write_base
+from shared import value_error
 
 from gaussian_swaying.fitting.background import Background
 from gaussian_swaying.gaussians.parts import Part, Parts
@@ -32,12 +33,12 @@ def test_what_moves_and_what_it_may_reach_is_left_out(folder):
     assert still.shape == (180, 320)
     assert 0.3 < still.double().mean() < 0.8
     column, row = project(scene.rest().means[scene.moving], camera)[0].long().unbind(1)
-    assert not bool(still[row, column].any())
+    assert not still[row, column].any()
     left, right = int(column.min()), int(column.max())
     reach = (right - left) // 5  # nearer than a quarter of its width
     middle = int(row.median())
-    assert not bool(still[middle, left - reach : right + reach].any())
-    assert bool(still[middle, : left - (right - left) // 2].all())
+    assert not still[middle, left - reach : right + reach].any()
+    assert still[middle, : left - (right - left) // 2].all()
 
 
 def test_a_part_that_moves_too_is_left_out(folder):
@@ -50,15 +51,15 @@ def test_a_part_that_moves_too_is_left_out(folder):
     simulation = Simulation(scene, wind=[4, 3, 0], device="cpu")
     camera = tripod(320, 180)
     whole, house = (Background(simulation, names).draw(camera)[1] for names in ((), ("tree",)))
-    assert bool((house <= whole).all())
+    assert (house <= whole).all()
     assert 0 < int(house.sum()) < 0.5 * int(whole.sum())
     assert not Background(simulation, ["tree", "house"]).exists
-    with pytest.raises(ValueError, match="no part 'cat': use one of 'flag', 'tree', 'house'"):
+    with value_error("no part 'cat': use one of 'flag', 'tree', 'house'"):
         Background(simulation, ["cat"])
 
 
 def test_a_splat_that_moves_as_a_whole_has_none(tmp_path):
     simulation = Simulation.from_yaml(write_base(tmp_path, wall=math.inf), device="cpu")
     assert not Background(simulation).exists
-    with pytest.raises(ValueError, match=r"the scene has no parts: set `scene\.parts`"):
+    with value_error(r"the scene has no parts: set `scene\.parts`"):
         Background(simulation, ["tree"])

@@ -7,6 +7,7 @@ import pytest
 import torch
 import yaml
 from bench.problems.films import write_video
+from shared import near, peak, value_error
 from small_films import TRUTH, cameras, changed
 
 from gaussian_swaying.fitting.changing import KNOTS, WALK, changes_of, knots_of, prior_of, steady_share
@@ -55,8 +56,8 @@ def test_variants_in_winds_that_change(own, simulation):
     steady, found, before = zip(*states_of(simulation, values, frames, alike=False), strict=True)
     (expected,) = zip(*states_of(other, [{}], frames, alike=False), strict=True)
     for mine, theirs in zip(found, expected, strict=True):
-        torch.testing.assert_close(mine.position, theirs.position, atol=1e-6, rtol=0)
-    assert (found[3].position - steady[3].position).abs().max() > 1e-3
+        near(mine.position, theirs.position, 1e-6)
+    assert peak(found[3].position - steady[3].position) > 1e-3
     assert not torch.equal(before[2].position, found[3].position)  # the wind at a time of the film is the same
 
 
@@ -87,10 +88,10 @@ def test_it_is_taken_where_it_predicts_better(fitted, tmp_path, ramp, capsys):
 
 
 def test_what_it_needs_is_said(tmp_path):
-    with pytest.raises(ValueError, match=r"Expected `wind\.speed` in `unknowns` with `wind_changes`: add it."):
+    with value_error(r"Expected `wind\.speed` in `unknowns` with `wind_changes`: add it."):
         Plan(["base"], ["video"], [AZIMUTH], wind_changes=True)
     file = tmp_path / "fit.yaml"
     given = {"base": "flag", "videos": "video", "unknowns": {"wind.speed": [1, 9]}, "wind_changes": 3}
     file.write_text(yaml.safe_dump(given))
-    with pytest.raises(ValueError, match=r"Expected `wind_changes` in .* to be true or false, but got 3"):
+    with value_error(r"Expected `wind_changes` in .* to be true or false, but got 3"):
         read_plan(file)

@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 import torch
+from shared import randn, seeded, value_error
 
 from gaussian_swaying.fitting import evidence
 from gaussian_swaying.fitting.evidence import (
@@ -38,9 +39,9 @@ def test_pictures_at_the_truth_and_away_from_it(own, simulation, masks):
 
 
 def test_scales_are_those_of_normal_noise():
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     for count in (1, 2, 3):
-        values = 0.3 * torch.randn(1, 4000, count, generator=generator, dtype=torch.float64)
+        values = 0.3 * randn(1, 4000, count, generator=generator)
         values[:, :200] = 50.0
         block = Block("tracks", values, torch.zeros(4000, dtype=torch.long))
         assert scales_of([block], {"tracks": 0.0})["tracks"] == pytest.approx(0.3, rel=0.1)
@@ -70,7 +71,7 @@ def test_weighed_tracks_are_those_times_their_weight(own, simulation):
 
 def test_silhouettes_need_masks(own, fit_of):
     videos = [dataclasses.replace(video, masks=None) for video in read_videos(own / "video")]
-    with pytest.raises(ValueError, match="no silhouettes"):
+    with value_error("no silhouettes"):
         fit_of({"wind.speed": [1, 9]}, videos=videos, stages=("silhouettes",))
 
 

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from handheld_films import drift, tripod, write_base
+from shared import peak, seeded
 
 from gaussian_swaying.fitting.background import Background
 from gaussian_swaying.fitting.exposure import gain_of, gains, with_gains
@@ -36,17 +37,17 @@ def _film(camera, images):
 def test_the_gain_of_each_frame_is_found(background, still):
     """With noise, and something dark that moves over a fifth of the background."""
     camera, picture, mask = still
-    generator, true = torch.Generator().manual_seed(0), drift(FRAMES)
+    generator, true = seeded(0), drift(FRAMES)
     images = [gain * picture + 3 * torch.randn(picture.shape, generator=generator) for gain in true]
     for k, image in enumerate(images):
         image[:, 5 * k : 5 * k + 40] *= 0.4
     found, unseen = gains(_film(camera, images), background)
     assert unseen == ()
-    assert (found / true - 1).abs().max() < 0.02
+    assert peak(found / true - 1) < 0.02
     video = with_gains(torch.stack(images).round().clamp(0, 255).to(torch.uint8), true)
     assert video.dtype == torch.uint8
     inside = mask & (torch.arange(200) > 80)
-    assert (video[:, inside].double().mean((0, 1)) / picture[inside].mean(0) - 1).abs().max() < 0.01
+    assert peak(video[:, inside].double().mean((0, 1)) / picture[inside].mean(0) - 1) < 0.01
 
 
 def test_what_is_cut_off_tells_nothing(background, still):

@@ -6,6 +6,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
+from shared import value_error
 
 from gaussian_swaying.fitting import film as films
 from gaussian_swaying.fitting.film import begins_to_move, first_frame, open_film
@@ -101,7 +102,7 @@ def test_a_hand_that_shakes_in_a_room(tmp_path):
 def test_a_large_film_is_read_in_reduced_size(tmp_path, monkeypatch):
     monkeypatch.setattr(films, "SIDE", 80)
     narrow = _film(tmp_path / "narrow.mp4", [np.zeros((16, 1600, 3), np.uint8)] * 2)
-    with pytest.raises(ValueError, match=r"narrow\.mp4 are read with 80 x 1 pixels, and an object needs 16"):
+    with value_error(r"narrow\.mp4 are read with 80 x 1 pixels, and an object needs 16"):
         open_film(narrow)
     film = open_film(_film(tmp_path / "a.mp4", [_square(60)] * 5))
     assert (film.width, film.height, film.full, film.fps) == (80, 48, 2.0, 25.0)
@@ -121,5 +122,5 @@ def test_the_focal_length_of_a_phone(tmp_path):
 
 def test_no_film(tmp_path):
     (tmp_path / "a.mp4").write_bytes(b"no film")
-    with pytest.raises(ValueError, match=r"a\.mp4 cannot be read"):
+    with value_error(r"a\.mp4 cannot be read"):
         open_film(tmp_path / "a.mp4")

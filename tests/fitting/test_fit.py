@@ -6,7 +6,7 @@ import shutil
 from dataclasses import replace
 
 import pytest
-import torch
+from shared import double, value_error
 from small_films import TRUTH, changed
 
 from gaussian_swaying.fitting.fit import GRIDS, ROUNDS, Course, run_fit
@@ -113,9 +113,9 @@ def test_the_error_of_the_grid_is_in_the_standard_errors(own, simulation, fit_of
     """None if the other grids show the same; if they show the flag in another wind, as far off as that wind."""
     made = fit_of(SPEED)
     evidence = made.evidence("tracks")
-    place = torch.tensor([made.plan.unknowns[0].share(5.0)], dtype=torch.float64)
+    place = double([made.plan.unknowns[0].share(5.0)])
     for _ in range(3):
-        place = torch.tensor(made.solved(place.tolist(), evidence, made.fitted), dtype=torch.float64)
+        place = double(made.solved(place.tolist(), evidence, made.fitted))
 
     def model(other):
         made.on_grid, made._other_grids = lambda ratio: other, None
@@ -173,12 +173,12 @@ def test_stopped_and_continued(fit_of, tmp_path):
 
 def test_resume_needs_the_same_plan(plan_of, tmp_path):
     plan = plan_of(SPEED, tracks=40, stages=["tracks"], search=0, iterations=1)
-    with pytest.raises(ValueError, match="nothing to resume"):
+    with value_error("nothing to resume"):
         run_fit(plan, tmp_path / "fit", resume=True, device="cpu", progress=False)
     first = run_fit(plan, tmp_path / "fit", device="cpu", progress=False)
     again = run_fit(plan, tmp_path / "fit", resume=True, device="cpu", progress=False)
     assert again.place == first.place
-    with pytest.raises(ValueError, match="another `tracks`"):
+    with value_error("another `tracks`"):
         run_fit(replace(plan, tracks=50), tmp_path / "fit", resume=True, device="cpu", progress=False)
 
 
@@ -188,10 +188,10 @@ def test_an_earlier_fit_beside_what_is_needed_is_not_moved(own, plan_of, tmp_pat
     other = plan_of(SPEED, search=0, iterations=1, tracks=40)
     plan = replace(other, base=[str(tmp_path / "base.yaml")])
     run_fit(plan, tmp_path, device="cpu", progress=False)
-    with pytest.raises(ValueError, match=r"base\.yaml is in it and is needed now: choose another with --output"):
+    with value_error(r"base\.yaml is in it and is needed now: choose another with --output"):
         run_fit(plan, tmp_path, device="cpu", progress=False)
     assert (tmp_path / "base.yaml").exists()
-    with pytest.raises(ValueError, match=r"base\.yaml is in it"):
+    with value_error(r"base\.yaml is in it"):
         run_fit(other, tmp_path, device="cpu", progress=False, in_use=[tmp_path / "base.yaml"])
 
 
@@ -217,7 +217,7 @@ def test_cameras_begin_together(own, fit_of):
     """Unless nothing moves until then."""
     left, right = read_videos(own / "video")
     cut = replace(right, **{name: getattr(right, name)[5:] for name in ("times", "cameras", "images", "masks")})
-    with pytest.raises(ValueError, match=r"camera right begin at 0\.208 s.*cut all videos to the same beginning"):
+    with value_error(r"camera right begin at 0\.208 s.*cut all videos to the same beginning"):
         fit_of(SPEED, videos=[left, cut])
     assert fit_of(SPEED | {"film.start": [0.25, 0.5]}, videos=[left, cut]).videos
     shift = tuple(time + 0.03 for time in right.times)  # by less than a frame
@@ -228,7 +228,7 @@ def test_what_cannot_be_told_apart_is_refused(fitted, tmp_path):
     """A membrane has E times thickness and density times thickness, and nothing that tells the three."""
     sought = {"material.E": [2e3, 5e4], "material.density": [5, 100], "material.thickness": [0.002, 0.05]}
     limit = 100.0  # the weakest direction is noise, a two hundredth of the strongest or less
-    with pytest.raises(ValueError, match="cannot tell") as error:
+    with value_error("cannot tell") as error:
         fitted(sought, search=0, limit=limit)
     for name in sought:
         assert f"`{name}`" in str(error.value)

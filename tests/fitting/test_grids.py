@@ -50,7 +50,7 @@ def test_a_grid_on_which_the_scene_diverges_says_nothing(simulation, left, monke
 
     monkeypatch.setattr(grids, "_pixels", lost)
     (part,) = trusted(simulation, [simulation, simulation], [left], {}, left.video.times[:3])
-    assert bool((part.trust == 1).all())
+    assert (part.trust == 1).all()
 
 
 def test_less_trust_is_no_better_fit(left):

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from shared import double, randn, seeded
 
 from gaussian_swaying.fitting.changing import changes_of
 from gaussian_swaying.fitting.gusts import gusts_of, spectrum
@@ -14,15 +15,15 @@ MEAN, INTENSITY, SCALE, EVERY = 4.0, 0.2, 0.8, 0.375
 
 def process(seed, seconds, error=0.0):
     """Speeds of Ornstein and Uhlenbeck's process at some times, and the covariance of their errors."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     count = round(seconds / EVERY) + 1
-    draw = torch.randn(2, count, generator=generator, dtype=torch.float64)
+    draw = randn(2, count, generator=generator)
     keep, speeds = math.exp(-EVERY / SCALE), [float(draw[0, 0])]
     for step in draw[0, 1:].tolist():
         speeds.append(keep * speeds[-1] + math.sqrt(1 - keep**2) * step)
     times = [EVERY * k for k in range(count)]
-    seen = MEAN * (1 + INTENSITY * torch.tensor(speeds, dtype=torch.float64)) + error * draw[1]
-    return times, seen, error**2 * torch.eye(count, dtype=torch.float64)
+    seen = MEAN * (1 + INTENSITY * double(speeds)) + error * draw[1]
+    return times, seen, error**2 * torch.eye(count).double()
 
 
 @pytest.mark.parametrize(("seconds", "error"), [(24.0, 0.0), (24.0, 0.3), (3.0, 0.1)])
@@ -51,10 +52,10 @@ def test_a_long_film_tells_the_time_scale_and_a_short_one_says_that_it_does_not(
 
 def test_errors_of_a_fit_are_no_gusts():
     """A steady wind that is seen with errors: a weak intensity, if the errors are known."""
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     times = [EVERY * k for k in range(40)]
-    speeds = MEAN + 0.4 * torch.randn(40, generator=generator, dtype=torch.float64)
-    seen = [spectrum(times, speeds, error**2 * torch.eye(40, dtype=torch.float64)) for error in (0.4, 0.01)]
+    speeds = MEAN + 0.4 * randn(40, generator=generator)
+    seen = [spectrum(times, speeds, error**2 * torch.eye(40).double()) for error in (0.4, 0.01)]
     assert seen[0].intensity[0] < 0.05
     assert seen[1].intensity[0] == pytest.approx(0.1, rel=0.2)
 

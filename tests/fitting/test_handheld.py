@@ -8,6 +8,7 @@ import pytest
 import torch
 from bench.problems.films import shaken
 from handheld_films import drift, off, tripod, write_base, write_film
+from shared import double, longest, value_error
 from small_films import TRUTH
 
 from gaussian_swaying.fitting import registration
@@ -24,7 +25,7 @@ pytest.importorskip("cv2", reason="needs the extra [fit]")
 
 WIDTH, HEIGHT, FRAMES = 320, 180, 25
 SOUGHT = {"wind.speed": [2.0, 12.0], "wind.azimuth": [-20.0, 100.0]}
-AT = torch.tensor([[0.2, 0.0, 0.15], [0.4, 0.0, 0.3], [0.4, 0.0, 0.0]], dtype=torch.float64)  # on the flag
+AT = double([[0.2, 0.0, 0.15], [0.4, 0.0, 0.3], [0.4, 0.0, 0.0]])  # on the flag
 
 
 @pytest.fixture(scope="module")
@@ -66,8 +67,8 @@ def test_the_camera_of_each_frame_is_found(film, folder, simulation):
     assert apart[:, 1].max() < 0.006
     shift = [project(AT, a)[0] - project(AT, b)[0] for a, b in zip(found.cameras, true, strict=True)]
     shake = [project(AT, video.cameras[0])[0] - project(AT, b)[0] for b in true]
-    assert torch.stack(shake).norm(dim=-1).max() > 5
-    assert torch.stack(shift).norm(dim=-1).max() < 0.5
+    assert longest(torch.stack(shake)) > 5
+    assert longest(torch.stack(shift)) < 0.5
     assert found.unseen == ()
     assert found.residual < 0.4
     assert found.cameras[0].world_to_camera.dtype == video.cameras[0].world_to_camera.dtype
@@ -105,7 +106,7 @@ def test_another_view_is_another_overlap():
     """From elsewhere, nearer, or rolled; a shake of half a degree is none."""
     eye, middle = torch.tensor([0.0, -2.0, 0.5]), torch.tensor([0.0, 0.0, 0.5])
     camera = look_at_camera(eye, middle, (0, 0, 1), 38.0, WIDTH, HEIGHT, dtype=torch.float64)
-    probes = torch.tensor([[0.0, 0.0, 0.5], [0.6, 0.0, 0.5], [0.0, 0.0, -0.1], [0.0, -0.6, 0.5]], dtype=torch.float64)
+    probes = double([[0.0, 0.0, 0.5], [0.6, 0.0, 0.5], [0.0, 0.0, -0.1], [0.0, -0.6, 0.5]])
 
     def seen(turn=0.0, near=1.0, roll=0.0, aim=0.0):
         angle, lean, aside = (math.radians(one) for one in (turn, roll, aim))
@@ -155,7 +156,7 @@ def test_a_film_without_background_is_refused(folder, simulation):
     (video,) = read_videos(folder / "hand")
     images = video.images.clone()
     images[8:] = 90
-    with pytest.raises(ValueError, match=r"17 of its 25 frames show too little .* on a tripod, or film something"):
+    with value_error(r"17 of its 25 frames show too little .* on a tripod, or film something"):
         follow_camera(replace(video, images=images), Background(simulation))
 
 

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from shared import double, randn, seeded, value_error
 
 from gaussian_swaying.fitting.evidence import Block, scales_of
 from gaussian_swaying.fitting.identifiability import check_apart, condition, directions
@@ -28,21 +29,21 @@ def _decay(truth, noise):
         found = amplitude * torch.exp(-rate * TIME)
         return torch.stack([found, 0.5 * found + 1], -1)
 
-    data = curve(torch.tensor(truth, dtype=torch.float64)) + noise
+    data = curve(double(truth)) + noise
     cluster = torch.arange(len(TIME)) // 4
     return lambda places: [Block("tracks", curve(places.double()) - data, cluster)]
 
 
 def _solve(residuals, start, iterations=30):
-    progress = Progress(torch.tensor(start, dtype=torch.float64))
+    progress = Progress(double(start))
     while not progress.done and progress.iteration < iterations:
         iterate(residuals, lambda blocks: scales_of(blocks, FLOORS), progress, 1e-7)
     return progress
 
 
 def test_outliers_count_little():
-    generator = torch.Generator().manual_seed(1)
-    noise = 0.01 * torch.randn(60, 2, generator=generator, dtype=torch.float64)
+    generator = seeded(1)
+    noise = 0.01 * randn(60, 2, generator=generator)
     noise[::10] += 3.0  # tracks that jumped to something else
     found = _solve(_decay([0.4, 0.3], noise), [0.9, 0.9])
     assert found.done
@@ -59,8 +60,8 @@ def test_standard_errors_are_the_scatter_of_repeated_fits():
     """Noise that is the same for four neighbours in time: s^2 A^-1 would be half of it."""
     places, errors = [], []
     for seed in range(60):
-        generator = torch.Generator().manual_seed(seed)
-        noise = 0.05 * torch.randn(15, 2, generator=generator, dtype=torch.float64).repeat_interleave(4, 0)
+        generator = seeded(seed)
+        noise = 0.05 * randn(15, 2, generator=generator).repeat_interleave(4, 0)
         residuals = _decay([0.4, 0.3], noise)
         place = _solve(residuals, [0.5, 0.4]).place
         normal, _, _ = linearised(residuals, lambda blocks: scales_of(blocks, FLOORS), place)
@@ -72,29 +73,29 @@ def test_standard_errors_are_the_scatter_of_repeated_fits():
 
 def test_an_exact_combination_is_named_and_refused():
     unknowns = [Unknown("material.E", 1e3, 1e5, "log"), Unknown("material.thickness", 1e-3, 1e-1, "log")]
-    row = torch.tensor([[1.0, 1.0]], dtype=torch.float64)  # only the product is seen
-    place = torch.tensor([0.5, 0.5], dtype=torch.float64)
+    row = double([[1.0, 1.0]])  # only the product is seen
+    place = double([0.5, 0.5])
     found = directions(100 * row.mT @ row, unknowns, place)
     assert condition(found) > 1e6
-    with pytest.raises(ValueError, match="cannot tell") as error:
+    with value_error("cannot tell") as error:
         check_apart(found, unknowns, 1e3)
     for words in ("`material.E` and `material.thickness`", "raising", "lowering", "10%", "`known`"):
         assert words in str(error.value)
-    check_apart(directions(torch.eye(2, dtype=torch.float64), unknowns, place), unknowns, 1e3)
+    check_apart(directions(torch.eye(2).double(), unknowns, place), unknowns, 1e3)
 
 
 def test_sensitivities_are_exact_to_second_order_and_stay_in_the_range():
     def squares(places):
-        assert bool(((places >= 0) & (places <= 1)).all())
+        assert ((places >= 0) & (places <= 1)).all()
         return [
             Block("tracks", (places.square() * torch.tensor([1.0, 3.0]))[:, None], torch.zeros(1, dtype=torch.long))
         ]
 
-    place = torch.tensor([0.5, 0.25], dtype=torch.float64)
+    place = double([0.5, 0.25])
     blocks, steps = sensitivities(squares, place)
     slopes = (blocks[0].values[1:] - blocks[0].values[:1])[:, 0] / steps[:, None]
     assert slopes.diagonal().tolist() == pytest.approx([1.0, 1.5])
-    assert sensitivities(squares, torch.tensor([0.0, 1.0], dtype=torch.float64))[1].min() > 0
+    assert sensitivities(squares, double([0.0, 1.0]))[1].min() > 0
 
 
 def valley(places):
@@ -105,7 +106,7 @@ def valley(places):
 
 
 def test_the_lowest_place_of_a_narrow_valley_is_found():
-    progress = Progress(torch.tensor([0.3, 0.081], dtype=torch.float64))
+    progress = Progress(double([0.3, 0.081]))
     while not progress.done and progress.iteration < 60:
         iterate(valley, lambda blocks: {"tracks": 0.1}, progress, 1e-5)
     assert progress.place.tolist() == pytest.approx([0.7, 0.441], abs=1e-3)
@@ -121,10 +122,10 @@ def test_after_a_shorter_step_the_sensitivities_are_those_of_its_end():
 
     def residuals(places):
         seen.append(len(places))
-        assert bool(((places >= 0) & (places <= 1)).all())
+        assert ((places >= 0) & (places <= 1)).all()
         return _steep(places)
 
-    progress = Progress(torch.tensor([0.3], dtype=torch.float64))
+    progress = Progress(double([0.3]))
     far = lambda place, step: place + 8 * step  # noqa: E731
     iterate(residuals, lambda blocks: {"tracks": 1.0}, progress, 1e-6, retract=far)
     assert seen == [3, 3, 5, 3]
@@ -146,7 +147,7 @@ def test_a_step_below_the_tolerance_that_is_not_better_is_the_end():
         seen.append(len(places))
         return _steep(places)
 
-    progress = Progress(torch.tensor([0.2001], dtype=torch.float64))
+    progress = Progress(double([0.2001]))
     iterate(residuals, lambda blocks: {"tracks": 1.0}, progress, 1e-3, retract=torch.sub)
     assert seen == [3, 3]
     assert progress.done == NO_STEP
@@ -162,7 +163,7 @@ def test_a_rough_valley_ends():
         values = torch.stack([x - 0.9 + wave, 30 * (y - 0.9 * x.square())], -1)[:, :, None]
         return [Block("tracks", values, torch.arange(2))]
 
-    progress = Progress(torch.tensor([0.3, 0.081], dtype=torch.float64))
+    progress = Progress(double([0.3, 0.081]))
     while not progress.done and progress.iteration < 40:
         iterate(rough, lambda blocks: {"tracks": 0.1}, progress, 9e-3, 3e-3)
     assert progress.done
@@ -173,12 +174,12 @@ def test_a_rough_valley_ends():
 def test_the_error_of_a_mean_is_that_of_its_clusters_and_of_its_residuals(clusters):
     """A mean of C clusters of equal size, in textbooks: variance of their means over C, and sigma^2 / n beside it."""
     size, sigma = 6, 0.2
-    draw = torch.randn(clusters, size, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    draw = randn(clusters, size, generator=seeded(3))
     values = 0.1 * (draw - draw.mean())  # all below HUBER, and their mean is the best place
     cluster = 2 * torch.arange(clusters).repeat_interleave(size)  # every other one is empty
     variants = torch.stack([values, values + 0.004])  # the unknown is added to each
     block = Block("tracks", variants.reshape(2, -1, 1), cluster)
-    found = normal_equations([block], {"tracks": sigma}, torch.tensor([0.004], dtype=torch.float64)).covariance()
+    found = normal_equations([block], {"tracks": sigma}, double([0.004])).covariance()
     between = values.mean(1).var() / clusters if clusters > 1 else 0.0
     expected = float(between + sigma**2 / (clusters * size))
     assert found.shape == (1, 1)
@@ -187,10 +188,10 @@ def test_the_error_of_a_mean_is_that_of_its_clusters_and_of_its_residuals(cluste
 
 def test_errors_that_are_alike_all_over_the_object_count_by_their_time():
     """As clusters: the mean of values that are off by one number in each half of the time."""
-    values = torch.tensor([0.1, -0.1], dtype=torch.float64).repeat_interleave(8)
+    values = double([0.1, -0.1]).repeat_interleave(8)
     cluster, moment = torch.arange(16) % 4, torch.arange(2).repeat_interleave(8)
     variants = torch.stack([values, values + 0.004])
-    steps = torch.tensor([0.004], dtype=torch.float64)
+    steps = double([0.004])
     sigma = 0.2
     found = [
         float(
@@ -207,7 +208,7 @@ def test_errors_that_are_alike_all_over_the_object_count_by_their_time():
 def test_the_cost_is_hubers_function():
     """Against torch's, on both sides of 1.345 standard deviations."""
     sigma = 0.5
-    values = torch.tensor([[0.1, -0.6, 0.67, -0.68, 2.0], [0.0, 1.0, -3.0, 0.5, 0.2]], dtype=torch.float64)
+    values = double([[0.1, -0.6, 0.67, -0.68, 2.0], [0.0, 1.0, -3.0, 0.5, 0.2]])
     blocks = [
         Block("tracks", values[:, :2, None], torch.zeros(2)),
         Block("tracks", values[:, 2:, None], torch.zeros(3)),

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from shared import double, longest, near
 from small_films import cameras
 
 from gaussian_swaying import Simulation
@@ -26,7 +27,7 @@ def test_where_a_gaussian_is_drawn_is_the_mean_of_its_pixels(simulation):
         white = painter.renderer(gaussians.means, gaussians.covariances, opacity, colours, camera).color[..., 0]
         sums[k] = torch.stack([white.sum(), (white * columns).sum(), (white * rows).sum()])
     shift = sums[:, 1:] / sums[:, :1] - centres
-    assert shift.norm(dim=-1).amax() > 1
+    assert longest(shift) > 1
     field = torch.zeros(120, 200, 3)
     for k in range(len(centres)):
         colours = torch.zeros(len(centres), 3)
@@ -35,7 +36,7 @@ def test_where_a_gaussian_is_drawn_is_the_mean_of_its_pixels(simulation):
     column, row = centres[20].long().tolist()
     window = field[row - 7 : row + 8, column - 7 : column + 8].sum((0, 1))
     found = drawn_beside(painter, gaussians, camera, centres[20:21])[0]
-    torch.testing.assert_close(found.float(), window[:2] / window[2], atol=1e-3, rtol=0)
+    near(found.float(), window[:2] / window[2], 1e-3)
 
 
 def test_only_the_surroundings_of_windows_are_drawn(simulation, monkeypatch):
@@ -50,7 +51,7 @@ def test_only_the_surroundings_of_windows_are_drawn(simulation, monkeypatch):
     found = drawn_beside(painter, gaussians, camera, places)
     assert max(drawn) < 0.5 * 600 * 360
     monkeypatch.setattr(overlap, "AROUND", 30.0)
-    torch.testing.assert_close(found, drawn_beside(painter, gaussians, camera, places), atol=1e-3, rtol=0)
+    near(found, drawn_beside(painter, gaussians, camera, places), 1e-3)
     assert drawn[-1] > 2 * max(drawn[:2])
     hook.remove()
     assert drawn_beside(painter, gaussians, camera, places[:0]).shape == (0, 2)
@@ -70,7 +71,7 @@ def test_the_offset_all_over_a_picture(simulation, monkeypatch):
     monkeypatch.setattr(overlap, "MANY", 7)
     torch.testing.assert_close(drawn_beside(painter, gaussians, camera, pixel[inside]), known)
     assert (found - known).norm(dim=-1).median() < 0.1
-    away = torch.tensor([[50.0, 0.0, 0.0]], dtype=torch.float64)
+    away = double([[50.0, 0.0, 0.0]])
     assert every.at(away).isfinite().all()
 
 
@@ -78,12 +79,12 @@ def test_between_the_points_of_its_lattice_it_is_linear(simulation):
     """An offset that is the pixel itself, as known on the lattice, is the pixel everywhere in it."""
     painter, camera = simulation.painter, cameras()["left"]
     found, means = Overlap(painter, painter.scene.rest(), camera), painter.scene.rest().means.double()
-    rows, columns = (found._step * torch.arange(n, dtype=torch.float64) + 0.5 for n in found._field.shape[2:])
+    rows, columns = (found._step * torch.arange(n).double() + 0.5 for n in found._field.shape[2:])
     found._field = torch.stack(torch.meshgrid(columns, rows, indexing="xy"))[None]
     pixel = project(means, camera)[0]
     inside = ((pixel > 1) & (pixel < torch.stack([columns[-1], rows[-1]]))).all(-1)
     assert int(inside.sum()) > 20
-    torch.testing.assert_close(found.at(means[inside]), pixel[inside], rtol=0, atol=1e-6)
+    near(found.at(means[inside]), pixel[inside], 1e-6)
 
 
 def test_the_edge_of_a_picture_does_not_cut_gaussians(simulation):
@@ -95,8 +96,8 @@ def test_the_edge_of_a_picture_does_not_cut_gaussians(simulation):
     cut, place = replace(camera, intrinsics=lens), torch.tensor([[3.0, 60.0]])
     whole = drawn_beside(painter, gaussians, camera, place + torch.tensor([[left - 3, 0.0]]))
     found = drawn_beside(painter, gaussians, cut, place)
-    assert float(whole.norm()) > 0.3
-    assert float((found - whole).norm()) < 0.3 * float(whole.norm())
+    assert whole.norm() > 0.3
+    assert (found - whole).norm() < 0.3 * whole.norm()
 
 
 def test_large_gaussians_have_no_part_in_it(simulation, monkeypatch):
@@ -111,7 +112,7 @@ def test_large_gaussians_have_no_part_in_it(simulation, monkeypatch):
     covariances = torch.cat([gaussians.covariances, 0.2**2 * torch.eye(3)[None]])
     monkeypatch.setattr(type(painter), "opacity", lambda self: torch.cat([opacity, torch.tensor([0.05])]))
     hazy = replace(gaussians, means=means, covariances=covariances)
-    assert float((drawn_beside(painter, hazy, camera, places) - known).norm(dim=-1).amax()) < 0.1
+    assert longest(drawn_beside(painter, hazy, camera, places) - known) < 0.1
 
 
 def test_a_large_picture_is_looked_at_in_a_smaller_one(simulation, monkeypatch):

@@ -4,6 +4,7 @@ import pytest
 import torch
 from bench.problems.films import shaken
 from handheld_films import drift, tripod, write_base, write_film
+from shared import peak, value_error
 
 from gaussian_swaying.fitting import prepared as module
 from gaussian_swaying.fitting.plan import read_plan
@@ -41,7 +42,7 @@ def test_a_tripod_keeps_its_camera_and_loses_the_drift(folder, simulation):
     assert judged.moved < 0.3
     assert judged.gains[0][2] == pytest.approx(0.65, abs=0.05)
     means = found.images.double().mean((1, 2))
-    assert (means[-1] / means[0] - 1).abs().max() < 0.05
+    assert peak(means[-1] / means[0] - 1) < 0.05
     assert lines == judged.sentences()
     assert "blue 0.6" in lines[0]
 
@@ -82,5 +83,5 @@ def test_the_fit_file(tmp_path):
     file.write_text(lines)
     assert read_plan(file).hand_held is None
     file.write_text(lines + "hand_held: maybe\n")
-    with pytest.raises(ValueError, match=r"`hand_held` in .* to be true or false, but got 'maybe'"):
+    with value_error(r"`hand_held` in .* to be true or false, but got 'maybe'"):
         read_plan(file)

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from shared import double, randn, seeded, value_error
 
 from gaussian_swaying import Simulation
 from gaussian_swaying.fitting.registration import cameras_around, find_camera
@@ -40,7 +41,7 @@ def frame(draw, truth):
     """In another light: darker from left to right, warmer, and with the noise of a sensor."""
     colour = draw(truth).color.double().clamp(0, 1)
     light = torch.linspace(1.0, 0.5, WIDTH, dtype=torch.float64)[None, :, None] * torch.tensor([1.0, 0.9, 0.7])
-    noise = 0.01 * torch.randn(colour.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    noise = 0.01 * randn(colour.shape, generator=seeded(0))
     return (255 * (light * colour**1.2 + noise).clamp(0, 1)).round().to(torch.uint8)
 
 
@@ -78,12 +79,12 @@ def test_with_the_focal_length(draw, frame, truth):
 def test_cameras_around_look_at_the_middle():
     for camera in cameras_around(MIDDLE, 2.0, UP, FOV, WIDTH, HEIGHT, count=4):
         local = camera.world_to_camera[:3, :3] @ MIDDLE.double() + camera.world_to_camera[:3, 3]
-        torch.testing.assert_close(local, torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64), atol=1e-9, rtol=0)
+        torch.testing.assert_close(local, double([0.0, 0.0, 2.0]), atol=1e-9, rtol=0)
         assert float(camera.world_to_camera[1, 2]) < 0  # z up is up in the picture
 
 
 def test_what_cannot_be_found_is_refused(draw, truth):
-    with pytest.raises(ValueError, match="was not found in the frame"):
+    with value_error("was not found in the frame"):
         find_camera(draw, torch.full((HEIGHT, WIDTH, 3), 90, dtype=torch.uint8), [truth])
-    with pytest.raises(ValueError, match="the frame's size, 100 x 80"):
+    with value_error("the frame's size, 100 x 80"):
         find_camera(draw, torch.zeros(80, 100, 3, dtype=torch.uint8), [truth])

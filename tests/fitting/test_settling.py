@@ -7,6 +7,7 @@ from operator import itemgetter
 
 import pytest
 import torch
+from shared import double, peak
 
 from gaussian_swaying.fitting.evidence import Block
 from gaussian_swaying.fitting.fit import Fit, run_fit
@@ -29,7 +30,7 @@ SCALES = {"tracks": 0.1}
 
 
 def _fitted(iterations):
-    progress = Progress(torch.tensor([0.3, 0.081], dtype=torch.float64))
+    progress = Progress(double([0.3, 0.081]))
     while not progress.done and progress.iteration < iterations:
         iterate(valley, lambda blocks: SCALES, progress, 1e-5)
     return progress
@@ -58,9 +59,9 @@ def test_a_direction_that_nothing_shows_is_not_called_unsettled():
     def flat(places):
         return [Block("tracks", torch.stack([places[:, 0] - 0.5, 1e-3 * places[:, 1] + 1], -1)[:, :, None], _TWO)]
 
-    place = torch.tensor([0.5, 0.5], dtype=torch.float64)
+    place = double([0.5, 0.5])
     normal, _, _ = linearised(flat, lambda blocks: {"tracks": 1.0}, place)
-    assert float((step_from(normal, place) - place).abs().amax()) > 0.2
+    assert peak(step_from(normal, place) - place) > 0.2
     assert unsettled(normal, place, UNKNOWNS, NO_STEP) == ""
 
 
@@ -71,7 +72,7 @@ def test_the_expected_gain_is_that_of_linear_residuals():
     def line(places):
         return [Block("tracks", (places @ torch.tensor([[1.0, 2.0], [0.5, 0.1]]).double() - 0.3)[:, :, None], _TWO)]
 
-    place = torch.tensor([0.2, 0.4], dtype=torch.float64)
+    place = double([0.2, 0.4])
     normal, _, _ = linearised(line, lambda blocks: {"tracks": 10.0}, place)
     target = step_from(normal, place)
     after, _, _ = linearised(line, lambda blocks: {"tracks": 10.0}, target)
@@ -82,7 +83,7 @@ def test_matches_reach_the_lowest_place_of_a_motion_that_soon_depends_on_everyth
     """Phases that part with time: from afar, all frames at once end beside the true rate 0.7, growing parts do not."""
 
     def end(steps):
-        place = torch.tensor([0.67], dtype=torch.float64)
+        place = double([0.67])
         for stage, share in steps:
             time = torch.linspace(0, 2, 49, dtype=torch.float64)[: max(3, round(share * 49))]
 

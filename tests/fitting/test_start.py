@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from shared import double, longest, peak
 from small_films import TRUTH
 
 from gaussian_swaying.fitting.evidence import TrackEvidence, compare, compare_starts
@@ -79,8 +80,8 @@ def test_variants_that_start_at_other_times(simulation):
     )
     assert torch.equal(late[2].position, early[0].position)
     assert not torch.equal(between[1].position, early[0].position)
-    moved = (early[4].position - early[0].position).norm(dim=-1).max()
-    assert (late[4].position - early[2].position).norm(dim=-1).max() < 6e-3 * moved
+    moved = longest(early[4].position - early[0].position)
+    assert longest(late[4].position - early[2].position) < 6e-3 * moved
     assert [float(state.time) for state in between] == pytest.approx([0, 0.5 / 24, 1.5 / 24, 2.5 / 24, 3.5 / 24])
 
 
@@ -130,7 +131,7 @@ def test_the_place_that_a_film_in_motion_begins_from(cut, fit_of, ends):
     """The wind whose simulation looks most like the first frame, and when it was so; not another wind's, nor rest."""
     made = fit_of(AZIMUTH | {FILM_START: ends}, cut)
     winds = (110.0, TRUTH["wind.azimuth"], -50.0)
-    places = torch.tensor([[made.plan.unknowns[0].share(wind), 0.5] for wind in winds], dtype=torch.float64)
+    places = double([[made.plan.unknowns[0].share(wind), 0.5] for wind in winds])
     azimuth, start = made.values(made.begin_from(places)).values()
     assert azimuth == pytest.approx(TRUTH["wind.azimuth"])
     assert start == pytest.approx(-CUT / 24, abs=0.05)
@@ -173,8 +174,8 @@ def test_starts_that_are_compared_at_once(own, simulation):
     (block,) = compare(simulation, evidence, apart, times, careful=False, moving=True)
     for number, (own_block,) in enumerate(together):
         assert own_block.values[0].shape == block.values[number].shape
-        assert (own_block.values[0] - block.values[number]).abs().max() < 0.02  # other steps
-    assert (together[0][0].values - together[1][0].values).abs().max() > 1
+        assert peak(own_block.values[0] - block.values[number]) < 0.02  # other steps
+    assert peak(together[0][0].values - together[1][0].values) > 1
 
 
 def test_gaussians_that_look_otherwise_are_not_seen(own, simulation):

@@ -10,6 +10,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
+from shared import double, value_error
 from small_films import FRAMES, cameras
 
 from gaussian_swaying.fitting import videos
@@ -38,7 +39,7 @@ def test_a_video_file(own, tmp_path):
     (film,) = read_videos(tmp_path)
     assert film.times == pytest.approx([k / 24 for k in range(FRAMES)], abs=1e-4)
     assert film.images.shape == (FRAMES, 128, 208, 3)
-    assert float((film.images[3, :120, :200].float() - pictures[3].astype("f4")).abs().mean()) < 6
+    assert (film.images[3, :120, :200].float() - pictures[3].astype("f4")).abs().mean() < 6
 
 
 def test_a_lens_with_distortion_and_pictures_beside_a_film(own, tmp_path):
@@ -61,7 +62,7 @@ def test_a_lens_with_distortion_and_pictures_beside_a_film(own, tmp_path):
     assert filmed.size != (208, 128)
     assert torch.equal(filmed.cameras[0].intrinsics, taken.cameras[0].intrinsics)
     assert torch.equal(filmed.cameras[0].world_to_camera, taken.cameras[0].world_to_camera)
-    assert float((filmed.images.float() - taken.images.float()).abs().mean()) < 6
+    assert (filmed.images.float() - taken.images.float()).abs().mean() < 6
 
 
 def test_a_mask_is_undistorted_as_its_frame(own, tmp_path):
@@ -74,14 +75,14 @@ def test_a_mask_is_undistorted_as_its_frame(own, tmp_path):
         assert video.size != (200, 120)
         assert torch.equal(video.masks, video.images[..., 1])
     iio.imwrite(tmp_path / frames[0]["mask_path"], np.zeros((120, 190), np.uint8))
-    with pytest.raises(ValueError, match=r"mask .* has 190 x 120 pixels, but its photo .* has 200 x 120"):
+    with value_error(r"mask .* has 190 x 120 pixels, but its photo .* has 200 x 120"):
         read_videos(tmp_path)
 
 
 def test_bad_videos(own, tmp_path):
     with pytest.raises(FileNotFoundError, match="does not exist"):
         read_videos(tmp_path / "nowhere")
-    with pytest.raises(ValueError, match=r"no transforms.json"):
+    with value_error(r"no transforms.json"):
         read_videos(tmp_path)
     shutil.copytree(own / "video", tmp_path / "video")
     file = tmp_path / "video/transforms.json"
@@ -94,7 +95,7 @@ def test_bad_videos(own, tmp_path):
         for frame in other["frames"]:
             change(frame)
         file.write_text(json.dumps(other))
-        with pytest.raises(ValueError, match=words):
+        with value_error(words):
             read_videos(tmp_path / "video")
 
 
@@ -103,9 +104,7 @@ def test_pictures_that_are_missing(own, tmp_path):
     shutil.copytree(own / "video", tmp_path, dirs_exist_ok=True)
     for k in (3, 7):
         (tmp_path / f"left_{k:04d}.png").unlink()
-    with pytest.raises(
-        ValueError, match=r"^2 of the pictures of `videos` do not exist, the first .*left_0003\.png: put"
-    ):
+    with value_error(r"^2 of the pictures of `videos` do not exist, the first .*left_0003\.png: put"):
         read_videos(tmp_path)
     assert len(read_videos(tmp_path, ["right"])[0].times) == FRAMES
 
@@ -148,7 +147,7 @@ def test_a_film_that_says_it_is_too_long_is_not_decoded(tmp_path, monkeypatch, d
     assert len(film.times) == 300
     assert decoded.pop(path.name) == film.images.numel()
     monkeypatch.setattr(videos, name, getattr(videos, name) - 1)
-    with pytest.raises(ValueError, match=r"film0.mp4, 64 x 64.*cut them"):
+    with value_error(r"film0.mp4, 64 x 64.*cut them"):
         read_videos(tmp_path)
     assert decoded == {path.name: 0}
 
@@ -164,7 +163,7 @@ def test_a_film_that_is_longer_than_it_says(tmp_path, monkeypatch, decoded):
     monkeypatch.setattr(imageio_ffmpeg, "read_frames", lying)
     monkeypatch.setattr(videos, "MOST_FRAMES", 100)
     path = _film(tmp_path, (64, 64), 3000)
-    with pytest.raises(ValueError, match="more than 100 frames"):
+    with value_error("more than 100 frames"):
         read_videos(tmp_path)
     assert decoded[path.name] == 101 * 3 * 64 * 64
 
@@ -208,7 +207,7 @@ def _variable(path):
 )
 def test_fields_of_a_film_are_named(tmp_path, size, fields, words):
     _film(tmp_path, size, 30, **fields)
-    with pytest.raises(ValueError, match=words):
+    with value_error(words):
         read_videos(tmp_path)
 
 
@@ -221,8 +220,8 @@ def test_a_film_with_a_variable_frame_rate(tmp_path, begin, rate):
     shown = (film.images[:, 32, 32, 1].double() * 219 / 255 + 16 - 20) / 60 - begin
     slower = 1.0 if rate is None else 65 / 2.95 / rate  # 65 frames in 2.95 s
     assert film.times[-1] / slower == pytest.approx(2.95 - begin, abs=0.1)
-    late = torch.tensor(film.times, dtype=torch.float64) / slower - shown
-    assert -0.05 < float(late.min()) < float(late.max()) < 0.1
+    late = double(film.times) / slower - shown
+    assert -0.05 < late.min() < late.max() < 0.1
 
 
 @pytest.mark.parametrize("rate", ["5", "24", "25", "24000/1001", "30000/1001", "100/3", "240"])
@@ -243,13 +242,13 @@ def test_frames_that_are_too_large(tmp_path, monkeypatch, decoded):
     decoded.clear()
     with monkeypatch.context() as smaller:
         smaller.setattr(videos, "MOST_PIXELS", 64 * 64 - 1)
-        with pytest.raises(ValueError, match=r"film0.mp4 has more than 4,095 pixels: make it smaller\.$"):
+        with value_error(r"film0.mp4 has more than 4,095 pixels: make it smaller\.$"):
             read_videos(tmp_path)
     assert decoded == {}
     huge.unlink()
     (tmp_path / "transforms.json").unlink()
     _film(tmp_path, (64, 64), 30, says=(64, 32))
-    with pytest.raises(ValueError, match="is not 64 x 32"):
+    with value_error("is not 64 x 32"):
         read_videos(tmp_path)
     assert decoded == {"film0.mp4": 0}
 
@@ -266,13 +265,13 @@ def test_a_camera_that_is_not_wanted_is_not_decoded(tmp_path, decoded):
 def test_a_camera_name_that_is_a_path(own, tmp_path, name):
     """Files of results are named after cameras."""
     _film(tmp_path, (64, 64), 3, camera=name)
-    with pytest.raises(ValueError, match=r"`frames\[0\].camera` .* without /"):
+    with value_error(r"`frames\[0\].camera` .* without /"):
         read_videos(tmp_path)
     given = json.loads((own / "video/transforms.json").read_text())
     given["frames"][0]["camera"] = name
     shutil.copytree(own / "video", tmp_path / "video")
     (tmp_path / "video/transforms.json").write_text(json.dumps(given))
-    with pytest.raises(ValueError, match=r"`frames\[0\].camera` .* without /"):
+    with value_error(r"`frames\[0\].camera` .* without /"):
         read_videos(tmp_path / "video")
 
 

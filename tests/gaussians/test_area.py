@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from shared import double, unit
+from shared import alike, double, normalized, rand, randn, unit, value_error
 from torch.testing import assert_close
 
 from gaussian_swaying.gaussians import area
@@ -17,12 +17,12 @@ UP = double([0.0, 0.0, 1.0])
 
 def _plane(kind, side):
     """side^2 points of the unit square."""
-    line = (torch.arange(side, dtype=torch.float64) + 0.5) / side
+    line = (torch.arange(side).double() + 0.5) / side
     points = torch.cartesian_prod(line, line)
     if kind == "jittered":
-        points = points + (torch.rand(side**2, 2, dtype=torch.float64) - 0.5) * 0.8 / side
+        points = points + (rand(side**2, 2) - 0.5) * 0.8 / side
     if kind == "random":
-        points = torch.rand(side**2, 2, dtype=torch.float64)
+        points = rand(side**2, 2)
     return torch.nn.functional.pad(points, (0, 1))
 
 
@@ -60,7 +60,7 @@ def test_each_patch_of_a_regular_plane_has_its_cell():
 @pytest.mark.parametrize("kind", ["spiral", "random"])
 def test_sum_is_the_area_of_a_sphere(kind, count, overlap):
     if kind == "spiral":
-        index = torch.arange(count, dtype=torch.float64)
+        index = torch.arange(count).double()
         z, angle = 1 - 2 * (index + 0.5) / count, index * math.pi * (3 - math.sqrt(5))
         radius = (1 - z * z).sqrt()
         points = torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=-1)
@@ -106,13 +106,13 @@ def test_clones_thickness_and_sizes_do_not_change_the_sum():
     assert float(_areas(lifted).sum()) == pytest.approx(1, abs=0.03)
     sizes, opacity = discs + 0.7 * torch.randn(count, 1), torch.rand(count)
     assert float(coverage_area(points, normals, sizes, opacity).sum()) == pytest.approx(1, abs=0.03)
-    tilted = torch.nn.functional.normalize(normals + 0.1 * torch.randn(count, 3), dim=-1)
+    tilted = normalized(normals + 0.1 * torch.randn(count, 3))
     assert float(_areas(points, tilted).sum()) == pytest.approx(1, abs=0.03)
 
 
 def test_faint_patch_among_opaque_ones_carries_little():
     points = _plane("regular", 20)
-    opacity = torch.ones(400, dtype=torch.float64)
+    opacity = torch.ones(400).double()
     opacity[210] = 0.01
     areas = _areas(points, opacity=opacity)
     assert areas[210] < 0.05 / 400
@@ -123,7 +123,7 @@ def test_twins_share_by_weight():
     """Two Gaussians at one centre: what one carries alone, they carry together."""
     points = _plane("regular", 20)
     points = torch.cat([points, points[210:211]])
-    opacity = torch.ones(401, dtype=torch.float64)
+    opacity = torch.ones(401).double()
     opacity[210], opacity[400] = 0.75, 0.25
     areas = coverage_area(points, UP.expand(401, 3), _discs(400, 1, 0.5)[:1].expand(401, 3), opacity)
     alone = _areas(points[:400])
@@ -135,7 +135,7 @@ def test_twins_share_by_weight():
 def test_few_or_lonely_gaussians_keep_their_own_area(count, device, dtype):
     means = 1e3 * torch.rand(count, 3, device=device, dtype=dtype)
     scales = torch.tensor([0.0, 0.5, -3.0], device=device, dtype=dtype).expand(count, 3)
-    areas = coverage_area(means, torch.nn.functional.normalize(torch.ones_like(means), dim=-1), scales)
+    areas = coverage_area(means, normalized(torch.ones_like(means)), scales)
     assert (areas.dtype, areas.device.type) == (dtype, device.type)
     assert_close(areas, patch_area(scales))
 
@@ -152,25 +152,25 @@ def test_wild_input_stays_finite_and_positive():
     assert coverage_area(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 3)).shape == (0,)
 
 
-@pytest.mark.skipif(not replaces((torch.ones(0, dtype=torch.float64),), torch.float64), reason="nothing is compiled")
+@pytest.mark.skipif(not replaces((torch.ones(0).double(),), torch.float64), reason="nothing is compiled")
 @pytest.mark.parametrize("neighbours", [6, 24])
 def test_the_kernel_of_the_cells_is_their_definition(neighbours, monkeypatch):
     """On a plane with borders, on several sheets, in clusters, on spikes, among stacked and lonely Gaussians."""
-    flat = torch.rand(300, 3, dtype=torch.float64) * double([1.0, 0.6, 0.0])
-    cluster = flat[:40] + 1e-3 * torch.randn(40, 3, dtype=torch.float64)
+    flat = rand(300, 3) * double([1.0, 0.6, 0.0])
+    cluster = flat[:40] + 1e-3 * randn(40, 3)
     above = flat[100:200] + double([0.0, 0.0, 0.03])
     stack = flat[200:210] + double([0.0, 0.0, 1e-9])
-    means = torch.cat([flat, cluster, above, stack, 5 + 10 * torch.rand(7, 3, dtype=torch.float64)])
-    normals = torch.tensor([0.0, 0.0, 1.0]) + 0.2 * torch.randn(len(means), 3, dtype=torch.float64)
+    means = torch.cat([flat, cluster, above, stack, 5 + 10 * rand(7, 3)])
+    normals = torch.tensor([0.0, 0.0, 1.0]) + 0.2 * randn(len(means), 3)
     normals[-7:] = torch.eye(3)[torch.arange(7) % 3]
-    log_scales = torch.log(0.005 + 0.05 * torch.rand(len(means), 3, dtype=torch.float64))
-    opacity = torch.rand(len(means), dtype=torch.float64)
+    log_scales = torch.log(0.005 + 0.05 * rand(len(means), 3))
+    opacity = rand(len(means))
     monkeypatch.setattr(area, "_CHUNK", 100)
     found = coverage_area(means, normals, log_scales, opacity, neighbours)
     asked = []
     monkeypatch.setattr(area, "replaces", lambda *_: asked.append(1))
     expected = coverage_area(means, normals, log_scales, opacity, neighbours)
-    assert_close(found, expected, rtol=3e-7, atol=0)  # torch divides by counts in float32
+    alike(found, expected, 3e-7)  # torch divides by counts in float32
     assert len(asked) == 5
 
 
@@ -180,13 +180,13 @@ def test_same_input_same_areas_and_order_does_not_matter():
     assert torch.equal(areas, _areas(points))
     order = torch.randperm(2500)
     assert_close(_areas(points[order]), areas[order])
-    assert_close(_areas(points, -UP).sum(), areas.sum(), rtol=2e-3, atol=0)
+    alike(_areas(points, -UP).sum(), areas.sum(), 2e-3)
 
 
 def test_coverage_rejects_bad_values():
     points = _plane("regular", 4)
     points[3, 1] = torch.nan
-    with pytest.raises(ValueError, match="Expected `means` to be finite"):
+    with value_error("Expected `means` to be finite"):
         _areas(points)
 
 
@@ -199,5 +199,5 @@ def test_patch_area_takes_the_two_larger_scales(device, dtype):
 
 
 def test_gradcheck_of_patch_area(device):
-    log_scales = torch.randn(4, 3, device=device, dtype=torch.float64, requires_grad=True)
+    log_scales = randn(4, 3, device=device, requires_grad=True)
     assert torch.autograd.gradcheck(patch_area, (log_scales,))

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from shared import double
+from shared import EYE, double, longest, rand, randn, seeded
 
 from gaussian_swaying.gaussians import connectivity
 from gaussian_swaying.gaussians.connectivity import pieces
@@ -14,20 +14,20 @@ STEP = 0.1  # spacing of the points
 
 
 def random(seed):
-    return torch.Generator().manual_seed(seed)
+    return seeded(seed)
 
 
 def sheet(seed, size=2.0, noise=0.15):
     """Points on a square in the x-y plane, moved by some spacings at random."""
     axis = torch.arange(0, size, STEP, dtype=torch.float64)
-    flat = torch.cartesian_prod(axis, axis, torch.zeros(1, dtype=torch.float64))
-    return flat + noise * STEP * torch.randn(flat.shape, generator=random(seed), dtype=torch.float64)
+    flat = torch.cartesian_prod(axis, axis, torch.zeros(1).double())
+    return flat + noise * STEP * randn(flat.shape, generator=random(seed))
 
 
 def attached_pairs(points, *parts, normals=None):
     """The pairs, with noisy normals: by default those of horizontal sheets."""
     own = double([0.0, 0.0, 1.0]).expand(len(points), 3) if normals is None else normals
-    own = own + 0.3 * torch.randn(own.shape, generator=random(9), dtype=torch.float64)
+    own = own + 0.3 * randn(own.shape, generator=random(9))
     return connectivity.attached_pairs(points, own, *parts)
 
 
@@ -46,7 +46,7 @@ def test_a_sheet_with_holes_is_one_piece(seed):
     points = points[torch.rand(len(points), generator=random(seed)) > 0.25]
     pairs = attached_pairs(points)
     assert number_of_pieces(points, pairs) == 1
-    assert (points[pairs[:, 0]] - points[pairs[:, 1]]).norm(dim=-1).amax() < 5 * STEP
+    assert longest(points[pairs[:, 0]] - points[pairs[:, 1]]) < 5 * STEP
 
 
 @pytest.mark.parametrize(("gap", "pieces"), [(0.4, 1), (4.0, 2)])
@@ -113,12 +113,12 @@ def test_what_hangs_together_is_never_taken_off():
     """A sheet that stands on another one, and is attached to nothing else."""
     upright = sheet(1) @ rotation(math.pi / 2).T
     points = torch.cat([sheet(0), upright + double([1.0, 0.0, 2.1])])
-    normals = torch.eye(3, dtype=torch.float64)[[2, 0]].repeat_interleave(len(upright), 0)
+    normals = EYE[[2, 0]].repeat_interleave(len(upright), 0)
     assert number_of_pieces(points, attached_pairs(points, normals=normals)) == 1
 
 
 def test_haze_is_attached_to_what_is_next_to_it():
-    haze = 2 * torch.rand(8, 3, generator=random(3), dtype=torch.float64) + torch.tensor([0, 0, 0.3])
+    haze = 2 * rand(8, 3, generator=random(3)) + torch.tensor([0, 0, 0.3])
     points = torch.cat([sheet(0), haze])
     pairs = attached_pairs(points)
     assert number_of_pieces(points, pairs) == 1
@@ -128,7 +128,7 @@ def test_a_twig_with_branches_is_one_piece():
     z = torch.arange(0, 3, STEP / 2, dtype=torch.float64)
     line = torch.stack([0 * z, 0 * z, z], -1)
     branch = torch.tensor([0, 0, 1.5]) + torch.stack([z, 0 * z, 0.5 * z], -1)
-    points = torch.cat([line, branch]) + 0.01 * torch.randn(2 * len(z), 3, generator=random(0), dtype=torch.float64)
+    points = torch.cat([line, branch]) + 0.01 * randn(2 * len(z), 3, generator=random(0))
     assert number_of_pieces(points, attached_pairs(points)) == 1
 
 

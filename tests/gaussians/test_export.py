@@ -1,12 +1,12 @@
 """Files for viewers: what is left out of them, films, and names; test_compact.py reads what gsplat wrote."""
 
 import math
-import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from shared import near, silent, user_warning, value_error
 from small_scenes import varied_cloud
 from torch.testing import assert_close
 from usd_files import read_usd_frame
@@ -35,12 +35,12 @@ def test_one_bad_value_does_not_empty_the_file(tmp_path):
     kept = torch.tensor([k for k in range(300) if k not in gone])
     for format in ("splat", "compressed_ply", "ply"):
         path = tmp_path / f"a{SUFFIXES[format]}"
-        with pytest.warns(UserWarning, match=r"left out 5 of 300 Gaussians: .*; 1 of 300 .* flat"):
+        with user_warning(r"left out 5 of 300 Gaussians: .*; 1 of 300 .* flat"):
             export_cloud(path, cloud, format=format)
         count = len(kept) - (1 if format == "compressed_ply" else 0)  # the fifth is clear, and so left out there
         assert len(read_gaussians(path)) == count
     assert torch.equal(read_gaussians(path).means, cloud.means[kept])
-    with pytest.warns(UserWarning, match="left out 5"):
+    with user_warning("left out 5"):
         clean = cleaned(path, cloud)
     assert clean.opacities[clean.opacities.argmax()] == 16.0
 
@@ -49,8 +49,7 @@ def test_equal_values_in_a_chunk_are_kept(tmp_path):
     """gsplat divides by the range of a chunk, which is zero for a flat white sheet."""
     cloud = varied_cloud(degree=0)
     cloud.means[:, 2], cloud.sh[:], cloud.scales[:] = 0.25, 1.0, -3.0
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with silent():
         export_cloud(tmp_path / "a.compressed.ply", cloud, format="compressed_ply")
     found = read_gaussians(tmp_path / "a.compressed.ply")
     assert (found.means[:, 2] == 0.25).all()
@@ -60,17 +59,17 @@ def test_equal_values_in_a_chunk_are_kept(tmp_path):
 
 def test_what_cannot_be_written_leaves_nothing(tmp_path):
     cloud = varied_cloud(3)
-    with pytest.raises(ValueError, match=f"`format` to be one of {', '.join(SUFFIXES)}, but got 'obj'"):
+    with value_error(f"`format` to be one of {', '.join(SUFFIXES)}, but got 'obj'"):
         export_cloud(tmp_path / "a.obj", cloud, format="obj")
     with pytest.raises(FileNotFoundError, match="is not a folder"):
         export_cloud(tmp_path / "no" / "a.splat", cloud, format="splat")
-    with pytest.raises(ValueError, match="is a folder: name a file inside it"):
+    with value_error("is a folder: name a file inside it"):
         export_cloud(tmp_path, cloud, format="splat")
     cloud.opacities[:] = -9.0
-    with pytest.raises(ValueError, match="all Gaussians are fainter than 1/255"):
+    with value_error("all Gaussians are fainter than 1/255"):
         export_cloud(tmp_path / "a.compressed.ply", cloud, format="compressed_ply")
     cloud.opacities[:] = math.nan
-    with pytest.raises(ValueError, match="3 of 3 Gaussians mean nothing: `opacity` is NaN for 3, first at index 0"):
+    with value_error("3 of 3 Gaussians mean nothing: `opacity` is NaN for 3, first at index 0"):
         export_cloud(tmp_path / "a.splat", cloud, format="splat")
     assert list(tmp_path.iterdir()) == []
 
@@ -131,9 +130,9 @@ def test_usd_keeps_the_place_of_a_gaussian_that_is_not_finite(tmp_path):
 
 def test_bad_films(tmp_path):
     pytest.importorskip("pxr")
-    with pytest.raises(ValueError, match="there are no frames"):
+    with value_error("there are no frames"):
         write_usd(tmp_path / "a.usdc", [])
-    with pytest.raises(ValueError, match="Frame 1 has another number"):
+    with value_error("Frame 1 has another number"):
         write_usd(tmp_path / "a.usdc", [varied_cloud(4), varied_cloud(5)])
     film = UsdFilm(25.0)
     film.add(0, usd_arrays(varied_cloud(4)))
@@ -142,7 +141,7 @@ def test_bad_films(tmp_path):
     between = read_usd_frame(tmp_path / "sparse.usdc", 1)["positions"]
     np.testing.assert_allclose(between, varied_cloud(4).means.numpy() + 0.2, atol=1e-6)
     (tmp_path / "sparse.usdc").unlink()
-    with pytest.raises(ValueError, match="Frame 6 has another number of Gaussians than frame 0"):
+    with value_error("Frame 6 has another number of Gaussians than frame 0"):
         film.add(6, usd_arrays(varied_cloud(5)))
     export_cloud(tmp_path / "one.usdc", varied_cloud(4), format="usd")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["one.usdc"]
@@ -168,7 +167,7 @@ def test_usd_without_its_library_is_one_sentence(tmp_path, monkeypatch):
 def test_the_name_says_the_format(tmp_path):
     names = {"a.ply": "ply", "a.compressed.ply": "compressed_ply", "a.splat": "splat", "a.usdc": "usd", "a.usda": "usd"}
     assert {name: format_of(name) for name in names} == names
-    with pytest.raises(ValueError, match=r"Cannot tell the format of a\.ksplat: .*\.splat"):
+    with value_error(r"Cannot tell the format of a\.ksplat: .*\.splat"):
         format_of("a.ksplat")
 
 
@@ -189,11 +188,11 @@ def test_a_sequence_becomes_numbered_files(name, last, tmp_path):
     assert sorted(files) == sorted((tmp_path / "new").iterdir())
     assert (len(files), files[-1].name) == (12, last)
     found = read_gaussians(files[-1])
-    assert_close(found.means.mean(0), cloud.means.mean(0) + 1.1, rtol=0, atol=1e-3)
+    near(found.means.mean(0), cloud.means.mean(0) + 1.1, 1e-3)
 
 
 def test_what_files_of_a_sequence_cannot_hold_is_told_once(tmp_path):
-    with pytest.warns(UserWarning, match=r"0\.splat: harmonics .* 3 warnings like this in 3 files\.") as told:
+    with user_warning(r"0\.splat: harmonics .* 3 warnings like this in 3 files\.") as told:
         export_frames(tmp_path / "#.splat", [varied_cloud(20)] * 3)
     assert len(told) == 1
 

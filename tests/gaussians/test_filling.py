@@ -5,7 +5,7 @@ from functools import cache
 
 import pytest
 import torch
-from shared import double
+from shared import EYE, double, normalized, rand, seeded, value_error
 from torch.testing import assert_close
 
 from gaussian_swaying.gaussians.filling import (
@@ -32,14 +32,14 @@ OFF = 0.18
 def _discs(normals, sigma):
     """Covariances of flat discs across the normals."""
     n = normals[:, :, None]
-    flat = torch.eye(3, dtype=torch.float64) - n * n.mT
+    flat = EYE - n * n.mT
     return sigma**2 * (flat + 0.01 * n * n.mT)
 
 
 def _ball(radius, spacing=H):
     """Points of a Fibonacci lattice on a sphere, and their normals."""
     count = round(4 * math.pi * radius**2 / spacing**2)
-    k = torch.arange(count, dtype=torch.float64) + 0.5
+    k = torch.arange(count).double() + 0.5
     z, angle = 1 - 2 * k / count, math.pi * (1 + math.sqrt(5)) * k
     across = (1 - z * z).sqrt()
     normals = torch.stack([across * angle.cos(), across * angle.sin(), z], -1)
@@ -47,8 +47,8 @@ def _ball(radius, spacing=H):
 
 
 def _torus(ring, tube, spacing=H):
-    u = torch.arange(round(2 * math.pi * (ring + tube) / spacing), dtype=torch.float64)
-    v = torch.arange(round(2 * math.pi * tube / spacing), dtype=torch.float64)
+    u = torch.arange(round(2 * math.pi * (ring + tube) / spacing)).double()
+    v = torch.arange(round(2 * math.pi * tube / spacing)).double()
     u, v = torch.cartesian_prod(2 * math.pi * u / len(u), 2 * math.pi * v / len(v)).unbind(-1)
     normals = torch.stack([v.cos() * u.cos(), v.cos() * u.sin(), v.sin()], -1)
     middle = ring * torch.stack([u.cos(), u.sin(), torch.zeros_like(u)], -1)
@@ -62,7 +62,7 @@ def _box(sides, spacing=H):
         lines = [(torch.arange(round(sides[i] / spacing)).double() + 0.5) * spacing - 0.5 * sides[i] for i in (a, b)]
         face = torch.cartesian_prod(*lines)
         for side in (-1, 1):
-            x, n = torch.zeros(2, len(face), 3, dtype=torch.float64)
+            x, n = torch.zeros(2, len(face), 3).double()
             x[:, a], x[:, b], x[:, axis] = face[:, 0], face[:, 1], 0.5 * side * sides[axis]
             n[:, axis] = side
             points.append(x)
@@ -110,13 +110,13 @@ def test_density_of_one_gaussian_is_its_formula():
     """Also the blur, which keeps two of the three standard deviations."""
     mean = double([[0.31, 0.52, 0.47]])
     scales = double([0.08, 0.05, 0.002])
-    q, _ = torch.linalg.qr(torch.rand(3, 3, dtype=torch.float64))
+    q, _ = torch.linalg.qr(rand(3, 3))
     cov = (q * scales**2) @ q.T
-    low, n = torch.zeros(3, dtype=torch.float64), (20, 21, 22)
+    low, n = torch.zeros(3).double(), (20, 21, 22)
     density = density_grid(mean, cov[None], torch.tensor([0.8]), low, H, n)
-    axes = [(torch.arange(k, dtype=torch.float64) + 0.5) * H for k in n]
+    axes = [(torch.arange(k).double() + 0.5) * H for k in n]
     offset = torch.cartesian_prod(*axes).reshape(*n, 3) - mean[0]
-    wide = cov + 0.25 * H**2 * torch.eye(3, dtype=torch.float64)
+    wide = cov + 0.25 * H**2 * EYE
     distance = (offset @ torch.linalg.inv(wide) * offset).sum(-1)
     peak = 0.8 * (scales[:2].square() / (scales[:2].square() + 0.25 * H**2)).prod().sqrt()
     expected = (peak * (-0.5 * distance).exp()).float()
@@ -126,10 +126,10 @@ def test_density_of_one_gaussian_is_its_formula():
 
 
 def test_a_gaussian_that_blew_up_is_cut_off():
-    cov = torch.eye(3, dtype=torch.float64)[None] * 1e6
+    cov = EYE[None] * 1e6
     mean = torch.full((1, 3), 0.5, dtype=torch.float64)
     density = density_grid(mean, cov, torch.ones(1), torch.zeros(3), H, (20, 20, 20), max_radius=2)
-    assert int((density > 0).sum()) == 5**3
+    assert (density > 0).sum() == 5**3
 
 
 @pytest.mark.parametrize("count", [6, 18, 26])
@@ -199,7 +199,7 @@ def test_depth_below_a_plane(normal, width):
 def test_sample_is_trilinear():
     x, y, z = torch.meshgrid(*(torch.arange(float(n)) for n in (4, 5, 6)), indexing="ij")
     field = 1 + 2 * x - 3 * y + 0.5 * z + 0.1 * x * y * z
-    p = torch.rand(50, 3, dtype=torch.float64) * torch.tensor([3.0, 4.0, 5.0])
+    p = rand(50, 3) * torch.tensor([3.0, 4.0, 5.0])
     a, b, c = p.unbind(-1)
     expected = (1 + 2 * a - 3 * b + 0.5 * c + 0.1 * a * b * c).float()
     assert_close(sample(field, p, chunk=7), expected, rtol=0, atol=1e-4)
@@ -270,7 +270,7 @@ def test_which_gaussians_are_on_the_surface():
     line = torch.arange(-0.5, 0.5, H, dtype=torch.float64) + 0.3 * H
     core = torch.cartesian_prod(line, line, line)
     core = core[core.norm(dim=-1) < 0.5 - 0.5 * H]
-    both = _shell(ball, (core, torch.nn.functional.normalize(core, dim=-1)))
+    both = _shell(ball, (core, normalized(core)))
     filling = _fill(*both)
     deep = 0.5 - both[0].norm(dim=-1)
     assert filling.on_surface[deep < 0.5 * H].all()
@@ -284,7 +284,7 @@ def test_which_gaussians_are_on_the_surface():
 def test_a_torn_surface_is_outvoted():
     """Three quarters of a dense ball taken away at random leave no hole wider than the Gaussians."""
     points, normals = _ball(0.5, 0.5 * H)
-    keep = torch.randperm(len(points), generator=torch.Generator().manual_seed(1))[: len(points) // 4]
+    keep = torch.randperm(len(points), generator=seeded(1))[: len(points) // 4]
     filling = _fill(points[keep], normals[keep])
     assert abs(_total_volume(filling) - math.pi / 6) < OFF * H * math.pi
 
@@ -292,15 +292,15 @@ def test_a_torn_surface_is_outvoted():
 def test_open_surfaces_enclose_nothing():
     u = torch.cartesian_prod(torch.arange(24).double(), torch.arange(16).double()) * H
     flag = torch.stack([u[:, 0], 0.05 * torch.sin(5 * u[:, 0]), u[:, 1]], -1)
-    across = torch.nn.functional.normalize(
-        torch.stack([-0.25 * torch.cos(5 * u[:, 0]), torch.ones(len(u)), torch.zeros(len(u))], -1), dim=-1
+    across = normalized(
+        torch.stack([-0.25 * torch.cos(5 * u[:, 0]), torch.ones(len(u)), torch.zeros(len(u))], -1)
     ).double()
     ball = _ball(0.5)
     bowl = ball[0][:, 2] < -0.1
     for points, normals in ((flag, across), (ball[0][bowl], ball[1][bowl])):
-        with pytest.raises(ValueError, match=r"Expected `filling` to find an inside.*remove `filling`"):
+        with value_error(r"Expected `filling` to find an inside.*remove `filling`"):
             _fill(points, normals, votes=0.9)
-    with pytest.raises(ValueError, match="find an inside"):
+    with value_error("find an inside"):
         _fill(flag, across)
 
 
@@ -341,15 +341,15 @@ def test_the_seed_moves_points_within_their_elements():
     ],
 )
 def test_bad_settings_are_refused(settings, words):
-    with pytest.raises(ValueError, match=words):
+    with value_error(words):
         InteriorFilling(**settings)
 
 
 def test_bad_bodies_are_refused():
     points, normals = _body("ball")
-    with pytest.raises(ValueError, match=r"at most 30,000,000 cells.*raise it"):
+    with value_error(r"at most 30,000,000 cells.*raise it"):
         _fill(points, normals, spacing=5e-4)
     points = points.clone()
     points[3, 1] = float("nan")
-    with pytest.raises(ValueError, match="finite"):
+    with value_error("finite"):
         _fill(points, normals)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from other_writers import FILES, assert_same, glb, glb_parts, refused, scene, turned
+from shared import near, peak, user_warning, value_error
 from small_scenes import varied_cloud
 from torch.testing import assert_close
 
@@ -37,7 +38,7 @@ def test_round_trip(degree, tmp_path):
     back = upright.means * 2, upright.scales + math.log(2)
     assert_same(type(found)(back[0], upright.quats, back[1], upright.opacities, upright.sh), cloud, **CLOSE)
     heights = cloud.means @ torch.nn.functional.normalize(up, dim=0)
-    assert_close(found.means[:, 1], 0.5 * heights, rtol=0, atol=2e-6)
+    near(found.means[:, 1], 0.5 * heights, 2e-6)
     export_cloud(tmp_path / "b.glb", cloud)  # z is up
     assert_close(read_gaussians(tmp_path / "b.glb").means[:, 1], cloud.means[:, 2])
 
@@ -105,10 +106,10 @@ def test_nodes_move_what_they_hold(tmp_path):
     )
     assert_same(first, expected, **CLOSE | {"means": 1e-5})
     stretch = torch.diag(torch.tensor([1.0, 3.0, 1.0]))
-    assert_close(second.means, cloud.means @ stretch + torch.tensor([5.0, 0, 0]), rtol=0, atol=1e-5)
+    near(second.means, cloud.means @ stretch + torch.tensor([5.0, 0, 0]), 1e-5)
     wide = stretch @ covariance(cloud.quats, cloud.scales) @ stretch
     assert_close(covariance(second.quats, second.scales), wide, rtol=1e-4, atol=1e-6)
-    assert_close(second.sh, cloud.sh, rtol=0, atol=1e-5)
+    near(second.sh, cloud.sh, 1e-5)
     del document["scenes"], document["scene"]  # then all nodes that are nobody's children
     assert len(read_gaussians(_written(tmp_path / "b.glb", document, data))) == 10
 
@@ -143,10 +144,10 @@ def test_numbers_of_every_kind(tmp_path):
     document["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(rows.tobytes()).decode()
     (tmp_path / "b.gltf").write_text(json.dumps(document))
     for name in ("a.gltf", "b.gltf"):
-        with pytest.warns(UserWarning, match="colours in linear light"):
+        with user_warning("colours in linear light"):
             cloud = read_gaussians(tmp_path / name)
         assert cloud.sh.shape == (6, 4, 3)
-        assert cloud.sh[:3, 1:].abs().max() == 0
+        assert peak(cloud.sh[:3, 1:]) == 0
         assert (cloud.sh[3:] == 0.25).all()
         assert torch.equal(cloud.means[:3], torch.eye(3))
         assert_close(cloud.quats[1], torch.tensor([1.0, -1.0, 0.0, 0.0]))
@@ -280,6 +281,6 @@ def test_bad_numbers(name, value, message, tmp_path):
 
 def test_too_large_for_the_format(tmp_path, monkeypatch):
     monkeypatch.setattr("gaussian_swaying.gaussians.gltf.LARGEST", 100)
-    with pytest.raises(ValueError, match=r"A \.glb file holds less than 4 GB, but this one would take"):
+    with value_error(r"A \.glb file holds less than 4 GB, but this one would take"):
         export_cloud(tmp_path / "a.glb", varied_cloud(2))
     assert not list(tmp_path.iterdir())

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from shared import longest, rand, seeded
 
 from gaussian_swaying.gaussians.grouping import grid_groups, joined, loose_points
 from gaussian_swaying.geometry.groups import sums
@@ -10,7 +11,7 @@ DX = 0.1
 
 
 def cloud(count=4000, seed=0):
-    return torch.rand(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return rand(count, 3, generator=seeded(seed))
 
 
 @pytest.mark.parametrize("per_cell", [1, 2, 3])
@@ -26,7 +27,7 @@ def test_points_of_a_group_share_their_nodes(per_cell):
         high = high.scatter_reduce(0, group, base[:, k], "amax")
         assert torch.equal(low, high)
     assert torch.equal(torch.floor(centre / DX - 0.5)[group], base)
-    far = (points - centre[group]).norm(dim=-1).max()
+    far = longest(points - centre[group])
     assert far < 3**0.5 * DX / per_cell
     expected = len(torch.unique(torch.floor((points / DX - 0.5) * per_cell), dim=0))
     assert int(group.max()) + 1 == expected

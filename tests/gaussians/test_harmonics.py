@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from shared import unit
+from shared import near, randn, unit, value_error
 from torch.testing import assert_close
 
 from gaussian_swaying.gaussians import harmonics
@@ -14,7 +14,7 @@ TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
 
 
 def _rotations(device, dtype, count=50):
-    q, r = torch.linalg.qr(torch.randn(count, 3, 3, dtype=torch.float64))
+    q, r = torch.linalg.qr(randn(count, 3, 3))
     q = q * r.diagonal(dim1=-2, dim2=-1).sign()[:, None]
     return (q * torch.linalg.det(q)[:, None, None]).to(device, dtype)
 
@@ -55,12 +55,12 @@ def test_evaluation(device, dtype, degree):
     directions = unit(50, 3, device=device, dtype=dtype)
     sh = torch.randn(50, (degree + 1) ** 2, 3, device=device, dtype=dtype)
     basis = _reference_basis(directions, degree)
-    assert_close(sh_basis(directions, degree), basis, rtol=0, atol=TOLERANCE[dtype])
+    near(sh_basis(directions, degree), basis, TOLERANCE[dtype])
     expected = torch.einsum("nk,nkc->nc", basis, sh)
     tolerance = 10 * TOLERANCE[dtype]
-    assert_close(evaluate_sh(sh, directions), expected, rtol=0, atol=tolerance)
-    assert_close(evaluate_sh(sh, 7 * directions), expected, rtol=0, atol=tolerance)
-    assert_close(sh_to_color(sh, directions), (expected + 0.5).clamp(min=0), rtol=0, atol=tolerance)
+    near(evaluate_sh(sh, directions), expected, tolerance)
+    near(evaluate_sh(sh, 7 * directions), expected, tolerance)
+    near(sh_to_color(sh, directions), (expected + 0.5).clamp(min=0), tolerance)
     assert (sh_to_color(sh, directions) == 0).any()
 
 
@@ -69,12 +69,12 @@ def test_the_basis_as_one_product(device, dtype, degree):
     """What a GPU does is what the basis is, with its gradient."""
     directions = unit(50, 3, device=device, dtype=dtype).requires_grad_()
     found, known = harmonics._basis_by_product(directions, degree), sh_basis(directions, degree)
-    assert_close(found, known, rtol=0, atol=TOLERANCE[dtype])
+    near(found, known, TOLERANCE[dtype])
     weights = torch.randn_like(known)
     gradients = [torch.autograd.grad((basis * weights).sum(), directions)[0] for basis in (found, known)]
     # along a direction they may differ: the basis is asked about unit vectors only
     across = [g - (g * directions).sum(-1, keepdim=True) * directions for g in gradients]
-    assert_close(across[0], across[1], rtol=0, atol=20 * TOLERANCE[dtype])
+    near(across[0], across[1], 20 * TOLERANCE[dtype])
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
@@ -104,11 +104,11 @@ def test_rotated_coefficients_equal_turned_directions(device, dtype, degree):
     sh = torch.randn(50, (degree + 1) ** 2, 3, device=device, dtype=dtype)
     turned = (rotation.mT @ directions[..., None]).squeeze(-1)
     actual = evaluate_sh(rotate_sh(sh, rotation), directions)
-    assert_close(actual, evaluate_sh(sh, turned), rtol=0, atol=TOLERANCE[dtype])
+    near(actual, evaluate_sh(sh, turned), TOLERANCE[dtype])
 
 
 def test_rotation_keeps_length_and_broadcasts(device):
-    sh = torch.randn(4, 16, 3, device=device, dtype=torch.float64)
+    sh = randn(4, 16, 3, device=device)
     rotation = _rotations(device, torch.float64, 6)[:, None]
     rotated = rotate_sh(sh, rotation)
     assert rotated.shape == (6, 4, 16, 3)
@@ -117,12 +117,12 @@ def test_rotation_keeps_length_and_broadcasts(device):
 
 
 def test_gradients(device):
-    sh = torch.randn(2, 16, 3, device=device, dtype=torch.float64, requires_grad=True)
+    sh = randn(2, 16, 3, device=device, requires_grad=True)
     rotation = _rotations(device, torch.float64, 2).requires_grad_()
     assert torch.autograd.gradcheck(rotate_sh, (sh, rotation), fast_mode=True)
     assert torch.autograd.gradcheck(evaluate_sh, (sh, unit(2, 3, device=device)), fast_mode=True)
 
 
 def test_wrong_arguments():
-    with pytest.raises(ValueError, match="Expected `sh` to have 1, 4, 9 or 16 coefficients, but got 5"):
+    with value_error("Expected `sh` to have 1, 4, 9 or 16 coefficients, but got 5"):
         evaluate_sh(torch.zeros(2, 5, 3), torch.ones(2, 3))

@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 import torch
+from shared import value_error
 from small_scenes import plain_cloud, together
 
 from gaussian_swaying.gaussians.harmonics import SH_DC
@@ -31,7 +32,7 @@ def test_what_is_apart_is_not_connected():
     assert torch.equal(connected(cloud, [0.0, 0.0, 0.0]), of(cloud, 0))
     assert torch.equal(connected(cloud, [2.0, 0.3, 0.4]), of(cloud, 1) | of(cloud, 2))
     assert connected(cloud, [0.0, 0.0, 0.0], reach=0.6).all()
-    with pytest.raises(ValueError, match="`reach`"):
+    with value_error("`reach`"):
         connected(cloud, [0.0, 0.0, 0.0], reach=0.0)
 
 
@@ -48,5 +49,5 @@ def test_another_colour_or_a_fold_ends_a_part():
 
 @pytest.mark.parametrize(("settings", "message"), [({"color": 0.0}, "`color`"), ({"angle": 91.0}, "`angle`")])
 def test_bad_limits_are_refused(settings, message):
-    with pytest.raises(ValueError, match=message):
+    with value_error(message):
         alike(sheet(), [0.0, 0.0, 0.0], **settings)

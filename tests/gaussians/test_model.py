@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from shared import gradients
+from shared import gradients, value_error
 from small_scenes import varied_cloud
 from torch.testing import assert_close
 
@@ -82,7 +82,7 @@ def test_model_methods_agree_with_the_functions(device, dtype):
     expected = coverage_area(cloud.means, model.normals(), cloud.scales, model.opacity())
     assert_close(model.areas("coverage"), expected)
     assert not torch.allclose(expected, patch_area(cloud.scales))
-    with pytest.raises(ValueError, match="Expected `mode` to be one of paper, coverage, open, but got 'disc'"):
+    with value_error("Expected `mode` to be one of paper, coverage, open, but got 'disc'"):
         model.areas("disc")
 
 
@@ -96,5 +96,5 @@ def test_model_deforms_a_batch(device, dtype):
     assert_close(deformed.normals, deform_normal(f, model.normals().expand(2, 6, 3)))
     deformed.covariances.sum().backward()
     assert model.quats.grad.abs().sum() > 0
-    with pytest.raises(ValueError, match=r"Expected `deformation_gradient` of shape \(6, 3, 3\)"):
+    with value_error(r"Expected `deformation_gradient` of shape \(6, 3, 3\)"):
         model.deformed(position, f[:, :5])

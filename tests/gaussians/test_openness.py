@@ -6,7 +6,7 @@ import math
 import bodies
 import pytest
 import torch
-from shared import unit
+from shared import EYE, alike, rand, seeded, unit
 from torch.testing import assert_close
 
 from gaussian_swaying.gaussians.area import coverage_area
@@ -31,7 +31,7 @@ def share(weight, areas, part=slice(None)):
 
 def sheets():
     """Half a metre apart, each is open on one side and almost open on the other."""
-    other = bodies.plate(4000, seed=1).turned(torch.eye(3, dtype=torch.float64), shift=0.5)
+    other = bodies.plate(4000, seed=1).turned(EYE, shift=0.5)
     return dataclasses.replace(bodies.plate(4000) + other, area=2.0)
 
 
@@ -129,7 +129,7 @@ def test_denser_leaves_lose_area():
     """The other side of the border, a known limit (docs/validation.md)."""
     body = bodies.leaf_ball(4, across=6)
     weight, areas = weights(body)
-    assert 0.85 < float((weight * areas).sum()) / body.area < 0.95
+    assert 0.85 < (weight * areas).sum() / body.area < 0.95
     assert float(areas.sum()) == pytest.approx(body.area, rel=0.05)  # nothing is lost with ``coverage``
 
 
@@ -146,15 +146,14 @@ def test_large_patches_shade_small_ones():
 def test_size_and_place_do_not_matter_and_rotation_hardly():
     """A power of two changes no bit but the depth's rounding; 24 fixed lines see a turned body about as well."""
     body = bodies.cluttered_sphere(8000)
-    eye = torch.eye(3, dtype=torch.float64)
     weight, areas = weights(body)
-    moved = body.turned(eye, 64.0, 1000.0)
+    moved = body.turned(EYE, 64.0, 1000.0)
     same = openness(moved.means, moved.normals, moved.log_scales, areas * 64.0**2, moved.opacity)
-    assert_close((same * areas).sum(), (weight * areas).sum(), rtol=1e-3, atol=0)
+    alike((same * areas).sum(), (weight * areas).sum(), 1e-3)
     rotation = quat_to_rotation(unit(4))
     turned = body.turned(rotation)
     other = openness(turned.means, turned.normals, turned.log_scales, areas, turned.opacity)
-    assert_close((other * areas).sum(), (weight * areas).sum(), rtol=0.02, atol=0)
+    alike((other * areas).sum(), (weight * areas).sum(), 0.02)
 
 
 def test_same_input_same_weights_and_neither_order_nor_sign_matters():
@@ -193,11 +192,11 @@ def test_wild_input_stays_between_the_limits():
 
 def test_depths_around_a_place_are_sums_over_its_own_column():
     """Against a sum over all parts; many sheets and skins reach beyond the ends of their column."""
-    draw = torch.Generator().manual_seed(0)
-    key = (5 * torch.rand(60, generator=draw, dtype=torch.float64)).sort().values
-    at = (5 * torch.rand(40, generator=draw, dtype=torch.float64)).sort().values
-    sheet, skin = torch.rand(2, 40, generator=draw, dtype=torch.float64)
-    optical = torch.rand(60, generator=draw, dtype=torch.float64)
+    draw = seeded(0)
+    key = (5 * rand(60, generator=draw)).sort().values
+    at = (5 * rand(40, generator=draw)).sort().values
+    sheet, skin = rand(2, 40, generator=draw)
+    optical = rand(60, generator=draw)
     passed = torch.nn.functional.pad(optical.cumsum(0), (1, 0))
     found = _split(key, at, passed, sheet, skin)
     away, own = key - at[:, None], key.floor() == at.floor()[:, None]

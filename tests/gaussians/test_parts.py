@@ -5,6 +5,7 @@ import zipfile
 import numpy as np
 import pytest
 import torch
+from shared import value_error
 
 from gaussian_swaying.gaussians.parts import Part, PartRegion, Parts
 
@@ -49,7 +50,7 @@ def test_the_file_keeps_labels_roles_and_materials(tmp_path):
     ],
 )
 def test_what_makes_no_sense_is_refused(make, message):
-    with pytest.raises(ValueError, match=message):
+    with value_error(message):
         make()
 
 
@@ -81,7 +82,7 @@ def test_a_file_that_does_not_fit_together_is_refused(change, message, tmp_path)
     else:
         arrays = dict(np.load(path)) | change
         np.savez(path, **{name: value for name, value in arrays.items() if value is not None})
-    with pytest.raises(ValueError, match=message) as error:
+    with value_error(message) as error:
         Parts.load(path)
     assert str(path) in str(error.value)
 

@@ -2,13 +2,13 @@
 
 import os
 import re
-import warnings
 
 import numpy as np
 import pytest
 import torch
 from other_writers import refused
 from plyfile import PlyData, PlyElement
+from shared import near, silent, user_warning, value_error
 from small_scenes import varied_cloud
 from torch.testing import assert_close
 
@@ -43,7 +43,7 @@ def _write(path, columns, byte_order="<", text=False, name="vertex"):
 
 def _assert_equal(actual, expected, fields=FIELDS):
     for field in fields:
-        assert_close(getattr(actual, field), getattr(expected, field), rtol=0, atol=0)
+        near(getattr(actual, field), getattr(expected, field), 0)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -51,14 +51,13 @@ def _assert_equal(actual, expected, fields=FIELDS):
 def test_round_trip_is_exact(tmp_path, degree, normals):
     cloud = varied_cloud(7, degree=degree, normals=normals)
     write_ply(tmp_path / "a.ply", cloud)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with silent():
         back = read_ply(tmp_path / "a.ply")
     _assert_equal(back, cloud)
     assert back.sh_degree == degree
     assert all(getattr(back, field).dtype == torch.float32 for field in FIELDS)
     expected = cloud.normals if normals else smallest_axis_normal(cloud.quats, cloud.scales)
-    assert_close(back.normals, expected, rtol=0, atol=0)
+    near(back.normals, expected, 0)
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
 
 
@@ -155,7 +154,7 @@ def test_zero_or_absent_normals_count_as_none(tmp_path):
 
 def test_extra_properties_are_named_once(tmp_path):
     columns = _columns() | {"red": np.arange(5, dtype="u1"), "label": np.arange(5, dtype="i4")}
-    with pytest.warns(UserWarning, match=r"extra\.ply: ignored the properties red, label") as record:
+    with user_warning(r"extra\.ply: ignored the properties red, label") as record:
         cloud = read_ply(_write(tmp_path / "extra.ply", columns))
     assert len(record) == 1
     _assert_equal(cloud, read_ply(_write(tmp_path / "plain.ply", _columns())))
@@ -235,7 +234,7 @@ def test_what_has_no_meaning_is_left_out(tmp_path, names, value, words):
     whole = read_ply(_write(tmp_path / "a.ply", columns))
     for name in names.split():
         columns[name][[3, 9]] = value
-    with pytest.warns(UserWarning, match=r"a\.ply: left out 2 of 40 .* for 2, first at index 3\.") as told:
+    with user_warning(r"a\.ply: left out 2 of 40 .* for 2, first at index 3\.") as told:
         found = read_ply(_write(tmp_path / "a.ply", columns))
     assert [words in str(warning.message) for warning in told] == [True]
     _assert_equal(found, whole.select(torch.tensor([k for k in range(40) if k not in (3, 9)])))
@@ -249,11 +248,10 @@ def test_flat_ones_become_a_thousandth_of_their_width(tmp_path):
     columns = _columns(1, count=9)
     whole = read_ply(_write(tmp_path / "a.ply", columns))
     columns["scale_2"][:3] = -np.inf, -1000.0, -50.0
-    with pytest.warns(UserWarning, match=r"a\.ply: 3 of 9 Gaussians have a size of zero, and become flat\."):
+    with user_warning(r"a\.ply: 3 of 9 Gaussians have a size of zero, and become flat\."):
         some = read_ply(_write(tmp_path / "a.ply", columns))
     del columns["scale_2"]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with silent():
         surfels = read_ply(_write(tmp_path / "b.ply", columns))
     thin = whole.scales[:, :2].amax(1) + np.log(1e-3)
     assert_close(some.scales[:3, 2], thin[:3])
@@ -296,11 +294,10 @@ def test_other_units_are_named(columns, refusal, words, tmp_path):
     if refusal:
         refused(path, words)
     else:
-        with pytest.warns(UserWarning, match=re.escape(words)) as told:
+        with user_warning(re.escape(words)) as told:
             assert len(read_ply(path)) == 60
         assert len(told) == 1
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with silent():
         read_ply(_write(path, _changed(**UTM)))
 
 
@@ -323,7 +320,7 @@ def test_a_file_of_another_kind_is_named(name, content, words, tmp_path):
 
 
 def test_write_needs_gaussians_and_a_folder(tmp_path):
-    with pytest.raises(ValueError, match=r"a\.ply was not written because the cloud holds zero Gaussians"):
+    with value_error(r"a\.ply was not written because the cloud holds zero Gaussians"):
         write_ply(tmp_path / "a.ply", varied_cloud(0, 3))
     with pytest.raises(FileNotFoundError, match=r"a\.ply cannot be written because .*none is not a folder; create it"):
         write_ply(tmp_path / "none" / "a.ply", varied_cloud(7, 3))
@@ -340,7 +337,7 @@ def test_cloud_selects_and_moves(device, dtype):
         assert (tensor.dtype, tensor.device.type) == (dtype, device.type)
         assert_close(tensor, getattr(cloud, field)[[0, 2, 6]])
     assert varied_cloud(7, 3).select(torch.tensor([1])).normals is None
-    with pytest.raises(ValueError, match="Expected `mask` of shape"):
+    with value_error("Expected `mask` of shape"):
         cloud.select(mask[:3])
 
 
@@ -349,9 +346,9 @@ def test_cloud_rejects_wrong_shape():
     shapes = {"means": (7, 2), "quats": (7, 3), "scales": (6, 3), "opacities": (7, 1), "sh": (7, 3), "normals": (3,)}
     for field, shape in shapes.items():
         tensors = {name: getattr(cloud, name) for name in FIELDS} | {field: torch.zeros(shape)}
-        with pytest.raises(ValueError, match=f"`{field}`"):
+        with value_error(f"`{field}`"):
             GaussianCloud(**tensors)
-    with pytest.raises(ValueError, match="`sh` to have 1, 4, 9 or 16 coefficients, but got 5"):
+    with value_error("`sh` to have 1, 4, 9 or 16 coefficients, but got 5"):
         GaussianCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, torch.zeros(7, 5, 3))
 
 
@@ -400,7 +397,7 @@ def test_a_file_that_is_longer_than_its_header_says_is_warned_of(tmp_path):
     write_ply(tmp_path / "flag.ply", varied_cloud(7, 3))
     with (tmp_path / "flag.ply").open("ab") as file:
         file.write(bytes(28))
-    with pytest.warns(UserWarning, match="28 bytes follow that its header does not mention"):
+    with user_warning("28 bytes follow that its header does not mention"):
         assert len(read_ply(tmp_path / "flag.ply")) == 7
     for line, other in ((b"vertex 7", b"vertex 5"), (b"property float rot_3\n", b"")):
         write_ply(tmp_path / "a.ply", varied_cloud(700 if other == b"" else 7, 3))

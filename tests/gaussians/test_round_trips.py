@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from other_writers import assert_same, in_order
+from shared import silent, user_warning, value_error
 from small_scenes import varied_cloud
 
 from gaussian_swaying.gaussians.cloud import joined
@@ -115,11 +116,10 @@ def test_what_a_format_cannot_hold_is_counted(kind, changes, words, tmp_path):
             cloud = replace(cloud, origin=value)
         else:
             getattr(cloud, name)[[3, 50, 99]] = value
-    with pytest.warns(UserWarning, match=re.escape(words)) as told:
+    with user_warning(re.escape(words)) as told:
         export_cloud(tmp_path / f"a.{kind}", cloud)
     assert len(told) == 1
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with silent():
         for whole in ("ply", "glb"):
             export_cloud(tmp_path / f"a.{whole}", cloud)
 
@@ -129,7 +129,7 @@ def test_steps_of_centres_are_those_of_the_file(kind, tmp_path):
     """One far Gaussian takes the bits of all others in SPZ, and of those in its chunk of a compressed .ply."""
     cloud = varied_cloud(600, degree=0)
     cloud.means[7] = 1e6
-    with pytest.warns(UserWarning, match="Gaussians are smaller than the steps of their centres") as told:
+    with user_warning("Gaussians are smaller than the steps of their centres") as told:
         export_cloud(tmp_path / f"a.{kind}", cloud)
     found = read_gaussians(tmp_path / f"a.{kind}")
     apart = torch.cdist(cloud.means.double(), found.means.double()).amin(1)
@@ -138,7 +138,7 @@ def test_steps_of_centres_are_those_of_the_file(kind, tmp_path):
     assert 0 < moved <= counted < 600
     if kind == "spz":
         assert (found.means * 8 == (found.means * 8).round()).all()
-        assert counted == int((cloud.scales.amax(1).exp() < 0.125).sum())
+        assert counted == (cloud.scales.amax(1).exp() < 0.125).sum()
 
 
 # ---- map coordinates
@@ -208,5 +208,5 @@ def test_a_film_is_moved_to_its_origin(tmp_path):
 def test_a_scene_says_where_its_coordinates_begin(tmp_path):
     export_cloud(tmp_path / "a.ply", _far())
     scene = Scene(ply=tmp_path / "a.ply", region=Box([500120.0, 4649770.0, 300.0], [500130.0, 4649780.0, 330.0]))
-    with pytest.raises(ValueError, match=r"No Gaussian is .*; coordinates count from \[50012\d\.\d, 464977\d\.\d, 31"):
+    with value_error(r"No Gaussian is .*; coordinates count from \[50012\d\.\d, 464977\d\.\d, 31"):
         scene.select(scene.cloud())

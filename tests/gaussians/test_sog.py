@@ -13,6 +13,7 @@ import pytest
 import torch
 from other_writers import FILES, assert_same, in_order, members, packed, refused, scene
 from PIL import Image
+from shared import seeded, user_warning, value_error
 from small_scenes import together, varied_cloud
 from torch.testing import assert_close
 
@@ -125,10 +126,10 @@ def test_one_level_of_a_streamed_scene(tmp_path):
     assert torch.equal(found.means[12:18], first.means[14:])
     assert torch.equal(found.sh[18:], read_sog(tmp_path / "0_1" / "a.sog").sh)
     assert len(read_sog(path, level=1)) == len(parts["1_0"]) == 5
-    with pytest.raises(ValueError, match="has the levels 0 to 1, but level 2 was asked for"):
+    with value_error("has the levels 0 to 1, but level 2 was asked for"):
         read_sog(path, level=2)
     path.write_text(path.read_text().replace("{", '{"environment": "env/meta.json", ', 1))
-    with pytest.warns(UserWarning, match="left out its environment, 'env/meta.json'"):
+    with user_warning("left out its environment, 'env/meta.json'"):
         assert len(read_gaussians(path)) == 28
 
 
@@ -218,7 +219,7 @@ def test_files_without_a_name_are_told(tmp_path):
     files = members(FILES / "scene.sog")
     meta = json.loads(files["meta.json"])
     del meta["shN"]
-    with pytest.warns(UserWarning, match=r"ignored the files shN_centroids\.webp, shN_labels\.webp, which its meta"):
+    with user_warning(r"ignored the files shN_centroids\.webp, shN_labels\.webp, which its meta"):
         read_gaussians(packed(tmp_path / "a.sog", files | {"meta.json": json.dumps(meta)}))
 
 
@@ -239,7 +240,7 @@ def test_a_code_book_may_hold_what_is_no_number(tmp_path):
         files = members(tmp_path / "a.sog")
         book = json.loads(files["meta.json"])[place.split()[0]]["codebook"]
         _set(place, [value, *book[1:]])(files)
-        with pytest.warns(UserWarning, match=re.escape(words)):
+        with user_warning(re.escape(words)):
             found = read_gaussians(packed(tmp_path / "b.sog", files))
         assert left <= len(found) <= 300
 
@@ -272,14 +273,14 @@ def test_files_elsewhere_are_not_read(tmp_path):
 def test_the_mark_of_antialiasing(tmp_path):
     files = members(FILES / "scene.sog")
     _set("model", "antialiased")(files)
-    with pytest.warns(UserWarning, match="trained with antialiasing"):
+    with user_warning("trained with antialiasing"):
         read_gaussians(packed(tmp_path / "a.sog", files))
 
 
 def test_more_harmonics_than_a_file_can_hold(tmp_path, monkeypatch):
     """Similar ones become one: close to their noise where there are patterns, and no more sets than allowed."""
     monkeypatch.setattr(sog, "PALETTE", 1024)
-    draw = torch.Generator().manual_seed(1)
+    draw = seeded(1)
     cloud = varied_cloud(4000, degree=2)
     pattern = torch.randint(0, 300, (4000,), generator=draw)
     clean = torch.randn(300, 9, 3, generator=draw)[pattern]
@@ -307,7 +308,7 @@ def test_sorted_along_a_curve():
     """Neighbours in space are neighbours in the file; the Gaussians of two places do not mix."""
     cloud = varied_cloud(50, degree=0)
     far = replace(cloud, means=cloud.means + 100)
-    both = together(cloud, far).select(torch.randperm(100, generator=torch.Generator().manual_seed(0)))
+    both = together(cloud, far).select(torch.randperm(100, generator=seeded(0)))
     order = sog._curve(both.means.double().numpy())
     assert sorted(order) == list(range(100))
     assert (both.means[torch.from_numpy(order)][:50] < 50).all()
@@ -316,6 +317,6 @@ def test_sorted_along_a_curve():
 def test_too_many_for_a_picture(tmp_path, monkeypatch):
     monkeypatch.setattr(sog, "LARGEST_SIDE", 8)
     export_cloud(tmp_path / "a.sog", varied_cloud(64, degree=0))
-    with pytest.raises(ValueError, match=r"A \.sog file holds up to 64 Gaussians, but there are 65: choose spz"):
+    with value_error(r"A \.sog file holds up to 64 Gaussians, but there are 65: choose spz"):
         export_cloud(tmp_path / "b.sog", varied_cloud(65, degree=0))
     assert [path.name for path in tmp_path.iterdir()] == ["a.sog"]

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from other_writers import FILES, assert_same, refused, scene, turned
+from shared import near, user_warning, value_error
 from small_scenes import varied_cloud
 from torch.testing import assert_close
 
@@ -65,17 +66,17 @@ def test_far_away_and_tiny(tmp_path):
     """The point moves for large scenes; sizes end at exp(-10); what does not fit is refused, and nothing is left."""
     cloud = varied_cloud(20, degree=0)
     cloud.means[3, 1], cloud.scales[5] = 1e5, -16.0
-    with pytest.warns(UserWarning, match="1 of 20 Gaussians have a size below 4.5e-05"):
+    with user_warning("1 of 20 Gaussians have a size below 4.5e-05"):
         export_cloud(tmp_path / "a.spz", cloud)
     found = read_gaussians(tmp_path / "a.spz")
-    assert_close(found.means, cloud.means, rtol=0, atol=2.0**-7)
+    near(found.means, cloud.means, 2.0**-7)
     assert found.scales[5].tolist() == [-10.0] * 3
-    with pytest.raises(ValueError, match=r"centres up to ±8e6 .* one is at 100000: remove"):
+    with value_error(r"centres up to ±8e6 .* one is at 100000: remove"):
         export_cloud(tmp_path / "b.spz", cloud, spz_version=1)
     cloud.means[3, 1] = 1e7
-    with pytest.raises(ValueError, match=r"one is at 1e[+]07"):
+    with value_error(r"one is at 1e[+]07"):
         export_cloud(tmp_path / "b.spz", cloud)
-    with pytest.raises(ValueError, match="`spz_version` to be 1, 2, 3 or 4, but got 5"):
+    with value_error("`spz_version` to be 1, 2, 3 or 4, but got 5"):
         export_cloud(tmp_path / "b.spz", cloud, spz_version=5)
     assert [path.name for path in tmp_path.iterdir()] == ["a.spz"]
 
@@ -95,10 +96,10 @@ def _put(place, kind, value):
 def test_flags_and_extensions_are_told(tmp_path):
     path = tmp_path / "a.spz"
     path.write_bytes(gzip.compress(_body(_put(14, "B", 1))))
-    with pytest.warns(UserWarning, match="trained with antialiasing"):
+    with user_warning("trained with antialiasing"):
         read_gaussians(path)
     path.write_bytes(gzip.compress(_body(_put(14, "B", 0x84))))
-    with pytest.warns(UserWarning, match="ignored the unknown `flags` 0x84"):
+    with user_warning("ignored the unknown `flags` 0x84"):
         read_gaussians(path)
     axes = struct.Struct("<IIIIII")  # an extension that is not known, and that of the axes
     for number, good in (
@@ -117,7 +118,7 @@ def test_flags_and_extensions_are_told(tmp_path):
         if good:
             assert len(read_gaussians(path)) == 2
         else:
-            with pytest.raises(ValueError, match=rf"left-handed axes \(number {number}\)"):
+            with value_error(rf"left-handed axes \(number {number}\)"):
                 read_gaussians(path)
     data = _body(_put(14, "B", 2), version=4)
     struct.pack_into("<I", longer := bytearray(data), 16, 32 + axes.size)
@@ -139,9 +140,9 @@ def test_harmonics_of_degree_4(tmp_path):
     rest = np.frombuffer(bytes(data[-90:]), "u1").reshape(2, 45)
     wider = np.concatenate([rest, np.full((2, 27), 7, "u1")], axis=1)
     (tmp_path / "a.spz").write_bytes(gzip.compress(bytes(data[:-90]) + wider.tobytes()))
-    with pytest.warns(UserWarning, match="ignored the harmonics of degree 4"):
+    with user_warning("ignored the harmonics of degree 4"):
         found = read_gaussians(tmp_path / "a.spz")
-    assert_close(found.sh, cloud.sh, rtol=0, atol=0.1)
+    near(found.sh, cloud.sh, 0.1)
 
 
 def test_bad_files(tmp_path):
@@ -224,7 +225,7 @@ def test_values_that_cannot_be_used(tmp_path):
     data = bytearray(gzip.decompress(encode_spz(varied_cloud(20, degree=0), 1)))
     data[16:18] = np.float16([np.nan]).tobytes()
     (tmp_path / "a.spz").write_bytes(gzip.compress(bytes(data)))
-    with pytest.warns(UserWarning, match="left out 1 of 20"):
+    with user_warning("left out 1 of 20"):
         assert len(read_gaussians(tmp_path / "a.spz")) == 19
     cloud = varied_cloud(20)
     cloud.opacities[5] = math.inf

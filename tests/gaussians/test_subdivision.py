@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from shared import alike, value_error
 from torch.testing import assert_close
 
 from gaussian_swaying.gaussians.area import coverage_area
@@ -47,7 +48,7 @@ def test_points_of_one_gaussian():
     everything = torch.cat([torch.zeros(1, 3), offset])
     assert nearest_neighbours(everything, 1)[0].max() <= 0.06
     pieces = (scales - found.log_scales[:1]).exp()[0]
-    assert_close(pieces, pieces.round(), rtol=1e-5, atol=0)
+    alike(pieces, pieces.round(), 1e-5)
     assert pieces[0] > pieces[1] >= 1
     assert pieces[2] == 1
 
@@ -97,7 +98,7 @@ def test_haze_is_refused():
     """A Gaussian of a hundred metres among small ones, before memory runs out."""
     means, quats, scales, opacity = _sheet(1.0, 0.1, 0.02)
     scales[3, :2] = math.log(100.0)
-    with pytest.raises(ValueError, match="particle_spacing"):
+    with value_error("particle_spacing"):
         subdivide(means, quats, scales, opacity, 0.01)
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from shared import double, gradients, unit
+from shared import EYE, double, gradients, near, randn, unit
 from torch.testing import assert_close
 
 from gaussian_swaying.geometry.covariances import (
@@ -49,8 +49,8 @@ def test_covariance_to_quat_scale_signs_follow_the_matrix():
     """A small change of the matrix may not flip an axis: frames of an animation would flicker."""
     a = covariance(unit(100, 4), double([0.0, -1.0, -2.0]).expand(100, 3))
     q0, _ = covariance_to_quat_scale(a)
-    q1, _ = covariance_to_quat_scale(a + 1e-9 * torch.eye(3, dtype=torch.float64))
-    assert_close(q1, q0, rtol=0, atol=1e-6)
+    q1, _ = covariance_to_quat_scale(a + 1e-9 * EYE)
+    near(q1, q0, 1e-6)
 
 
 def test_deformed_covariance_is_that_of_mapped_samples(device, dtype):
@@ -89,9 +89,8 @@ def test_gaussians_are_drawn_out_to_a_limit(device, dtype):
 
 
 def test_the_limit_on_stretch_is_reached_without_a_jump():
-    rest = torch.eye(3, dtype=torch.float64)
-    close = [_drawn(torch.diag(double([a**0.5, 1.0, 1.0]))[None], rest[None]) for a in (10.0 - 1e-9, 10.0 + 1e-9)]
-    assert_close(close[0], close[1], rtol=0, atol=1e-7)
+    close = [_drawn(torch.diag(double([a**0.5, 1.0, 1.0]))[None], EYE[None]) for a in (10.0 - 1e-9, 10.0 + 1e-9)]
+    near(close[0], close[1], 1e-7)
 
 
 def test_a_solid_beyond_the_limit_goes_back_to_its_own_shape(device, dtype):
@@ -117,5 +116,5 @@ def test_a_solid_beyond_the_limit_goes_back_to_its_own_shape(device, dtype):
 
 def test_gradcheck(device):
     f = gradients(20, device)[:4].requires_grad_()
-    a = covariance(unit(4, 4, device=device), torch.randn(4, 3, device=device, dtype=torch.float64)).requires_grad_()
+    a = covariance(unit(4, 4, device=device), randn(4, 3, device=device)).requires_grad_()
     assert torch.autograd.gradcheck(deform_covariance, (f, a))

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from shared import double, unit
+from shared import EYE, double, near, normalized, rand, randn, unit
 from torch.testing import assert_close
 
 from gaussian_swaying.geometry.directions import axes_across, hull_area, spread_lines
@@ -14,8 +14,8 @@ from gaussian_swaying.geometry.rotations import quat_to_rotation
 def test_lines_are_spread_evenly():
     """The second moment of directions is a third of the identity; a spiral of n points has it up to about 1 / n."""
     lines = spread_lines(100)
-    assert_close(lines.norm(dim=-1), torch.ones(100, dtype=torch.float64))
-    assert_close(lines.mT @ lines / 100, torch.eye(3, dtype=torch.float64) / 3, rtol=0, atol=0.01)
+    assert_close(lines.norm(dim=-1), torch.ones(100).double())
+    near(lines.mT @ lines / 100, EYE / 3, 0.01)
     assert lines[:, 2].min() > 0
 
 
@@ -33,21 +33,21 @@ def test_no_two_lines_of_a_spiral_are_close():
     """
     lines = spread_lines(100)
     apart = torch.cdist(lines, lines).fill_diagonal_(math.inf)
-    assert float(apart.amin()) ** 2 > 0.64 * 4 * math.pi / (math.sqrt(3) * 100)
+    assert apart.amin() ** 2 > 0.64 * 4 * math.pi / (math.sqrt(3) * 100)
 
 
 def test_axes_across_make_a_right_handed_frame():
-    lines = torch.cat([spread_lines(50), torch.eye(3, dtype=torch.float64)])
+    lines = torch.cat([spread_lines(50), EYE])
     first, second = axes_across(lines)
     frame = torch.stack([first, second, lines], dim=-1)
-    assert_close(frame.mT @ frame, torch.eye(3, dtype=torch.float64).expand(53, 3, 3))
-    assert_close(torch.linalg.det(frame), torch.ones(53, dtype=torch.float64))
+    assert_close(frame.mT @ frame, EYE.expand(53, 3, 3))
+    assert_close(torch.linalg.det(frame), torch.ones(53).double())
 
 
 def test_hull_of_a_box_a_ball_and_a_sheet():
     """Exact up to the outline with 128 sides and 100 directions: a percent."""
     rotation, scale = quat_to_rotation(unit(4)), 30.0
-    box = torch.rand(5000, 3, dtype=torch.float64)
+    box = rand(5000, 3)
     corners = torch.cartesian_prod(*(double([0.0, 1.0]),) * 3)
     sides = double([1.0, 0.5, 0.2])
     found = hull_area(torch.cat([box, corners]) * sides @ rotation.mT * scale + 100)
@@ -58,7 +58,7 @@ def test_hull_of_a_box_a_ball_and_a_sheet():
 
 
 def test_hull_of_a_body_with_holes_is_that_of_its_corners():
-    ring = torch.nn.functional.normalize(torch.randn(5000, 3, dtype=torch.float64)[:, :2], dim=-1)
+    ring = normalized(randn(5000, 3)[:, :2])
     flat = torch.nn.functional.pad(ring, (0, 1))
     assert hull_area(flat) == pytest.approx(2 * math.pi, rel=0.01)
 

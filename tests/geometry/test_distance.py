@@ -5,7 +5,7 @@ import os
 
 import pytest
 import torch
-from shared import double
+from shared import double, near, rand, value_error
 from torch.testing import assert_close
 
 from gaussian_swaying.geometry import meshes
@@ -21,7 +21,7 @@ from gaussian_swaying.geometry.meshes import mesh_distance, read_mesh, triangle_
 from gaussian_swaying.geometry.rotations import rotation_of
 
 HALF = double([0.3, 0.2, 0.5])
-EYE = torch.eye(3, dtype=torch.float64).reshape(-1)
+EYE = torch.eye(3).double().reshape(-1)
 
 
 def _asked(function, *numbers):
@@ -38,7 +38,7 @@ SOLIDS = {
 
 
 def _places(count=4000):
-    return 2 * torch.rand(count, 3, dtype=torch.float64) - 1
+    return 2 * rand(count, 3) - 1
 
 
 @pytest.mark.parametrize("solid", SOLIDS)
@@ -48,22 +48,22 @@ def test_the_gradient_is_that_of_the_distance(solid):
     distance, normal = SOLIDS[solid](place)
     (slope,) = torch.autograd.grad(distance.sum(), place)
     assert_close(normal, slope)
-    assert_close(normal.norm(dim=-1), torch.ones(len(place), dtype=torch.float64))
+    assert_close(normal.norm(dim=-1), torch.ones(len(place)).double())
     outside = distance > 0
     foot = (place - distance[:, None] * normal)[outside]
-    assert_close(SOLIDS[solid](foot)[0], torch.zeros(len(foot), dtype=torch.float64), atol=1e-12, rtol=0)
+    near(SOLIDS[solid](foot)[0], torch.zeros(len(foot)).double(), 1e-12)
 
 
 def test_the_middle_of_a_solid_has_a_normal():
     for solid in SOLIDS.values():
-        distance, normal = solid(torch.zeros(1, 3, dtype=torch.float64))
+        distance, normal = solid(torch.zeros(1, 3).double())
         assert distance < 0
         assert abs(float(normal.norm()) - 1) < 1e-12
 
 
 def test_a_grid_interpolates_and_extends():
     """A linear distance is exact within the grid; outside it grows with the distance from it."""
-    axes = [torch.arange(n, dtype=torch.float64) * 0.25 - 0.5 for n in (5, 6, 7)]
+    axes = [torch.arange(n).double() * 0.25 - 0.5 for n in (5, 6, 7)]
     direction = double([0.48, 0.6, 0.64])
     nodes = torch.cartesian_prod(*axes)
     grid = DistanceGrid((nodes @ direction).reshape(5, 6, 7), torch.full((3,), -0.5, dtype=torch.float64), 0.25)
@@ -107,10 +107,10 @@ def test_a_mesh_has_the_distance_of_the_box_that_it_is(tmp_path):
     assert faces.shape == (12, 3)
     grid = mesh_distance(vertices, faces, cells=16)
     nodes = torch.cartesian_prod(
-        *(grid.origin[k] + grid.spacing * torch.arange(n, dtype=torch.float64) for k, n in enumerate(grid.values.shape))
+        *(grid.origin[k] + grid.spacing * torch.arange(n).double() for k, n in enumerate(grid.values.shape))
     )
     exact = _asked(box_distance, torch.ones(3), EYE)(nodes)[0]
-    assert_close(grid.values.reshape(-1), exact, atol=1e-12, rtol=0)
+    near(grid.values.reshape(-1), exact, 1e-12)
 
 
 def test_a_ply_is_read_as_the_obj(tmp_path):
@@ -132,7 +132,7 @@ def test_a_ply_is_read_as_the_obj(tmp_path):
 def test_an_open_mesh_is_refused(tmp_path):
     file = tmp_path / "open.obj"
     file.write_text("\n".join(CUBE_OBJ.strip().splitlines()[:-1]))
-    with pytest.raises(ValueError, match="not closed"):
+    with value_error("not closed"):
         mesh_distance(*read_mesh(file), cells=16)
 
 
@@ -172,7 +172,7 @@ ROWS = "0 0 0\n1 0 0\n0 1 0\n"
 )
 def test_a_bad_mesh_is_refused_by_name(tmp_path, name, text, message):
     (tmp_path / name).write_text(text, errors="surrogateescape")
-    with pytest.raises(ValueError, match=message) as refused:
+    with value_error(message) as refused:
         read_mesh(tmp_path / name)
     assert str(tmp_path / name) in str(refused.value)
 
@@ -182,7 +182,7 @@ def test_a_list_that_claims_four_billion_corners(tmp_path):
     head = _ply("element vertex 1", *"xyz").replace("ascii", "binary_little_endian").removesuffix("end_header\n")
     file = tmp_path / "a.ply"
     file.write_bytes((head + FACE.format("uint double vertex_indices")).encode() + bytes(12) + b"\xff" * 4)
-    with pytest.raises(ValueError, match="cannot be read"):
+    with value_error("cannot be read"):
         read_mesh(file)
 
 
@@ -191,7 +191,7 @@ def test_a_list_that_claims_four_billion_corners(tmp_path):
 def test_a_pipe_is_no_mesh(tmp_path, name):
     """Reading one waits for ever."""
     os.mkfifo(tmp_path / name)
-    with pytest.raises(ValueError, match="not a regular file"):
+    with value_error("not a regular file"):
         read_mesh(tmp_path / name)
 
 
@@ -200,13 +200,13 @@ def test_a_mesh_that_is_far_too_large(tmp_path, monkeypatch):
     monkeypatch.setattr(meshes, "LARGEST_MESH", file.stat().st_size)
     vertices, faces = read_mesh(file)
     monkeypatch.setattr(meshes, "LARGEST_MESH", file.stat().st_size - 1)
-    with pytest.raises(ValueError, match=r"more than the .* that the mesh may have"):
+    with value_error(r"more than the .* that the mesh may have"):
         read_mesh(file)
     sides = 12 * 23**2  # sqrt(2) 16 cells
     monkeypatch.setattr(meshes, "MOST_SQUARES", sides)
     mesh_distance(vertices, faces, cells=16)
     monkeypatch.setattr(meshes, "MOST_SQUARES", sides - 1)
-    with pytest.raises(ValueError, match="12 triangles, too many"):
+    with value_error("12 triangles, too many"):
         mesh_distance(vertices, faces, cells=16)
 
 
@@ -214,21 +214,21 @@ def test_a_mesh_without_an_inside_is_refused(tmp_path):
     """Without a node inside, the material would pass through."""
     vertices, faces = read_mesh(_cube(tmp_path))
     thin = double([1.0, 1.0, 1e-3])
-    with pytest.raises(ValueError, match=r"encloses none of the nodes of its grid, 0\.125 apart"):
+    with value_error(r"encloses none of the nodes of its grid, 0\.125 apart"):
         mesh_distance(thin * vertices, faces, cells=16)
     for size, word in ((0.0, "no extent"), (1e308, "infinite")):
-        with pytest.raises(ValueError, match=word):
+        with value_error(word):
             mesh_distance(size * vertices, faces, cells=16)
 
 
 def test_distances_of_triangles_agree_with_samples():
-    corners = torch.rand(50, 3, 3, dtype=torch.float64)
+    corners = rand(50, 3, 3)
     place = _places(50)
     found = triangle_distance(place, corners)
-    share = torch.distributions.Dirichlet(torch.ones(3, dtype=torch.float64)).sample((20000,))
+    share = torch.distributions.Dirichlet(torch.ones(3).double()).sample((20000,))
     sampled = (place[:, None] - share @ corners).norm(dim=-1).amin(-1)
     assert (found <= sampled + 1e-12).all()
-    assert_close(found, sampled, atol=0.02, rtol=0)
+    near(found, sampled, 0.02)
 
 
 def test_the_distance_of_a_triangle_without_area_is_that_of_its_longest_side():
@@ -236,7 +236,7 @@ def test_the_distance_of_a_triangle_without_area_is_that_of_its_longest_side():
     place = double([[-3.0, 4.0, 0.0], [0.5, 0.0, 2.0], [2.0, -3.0, 4.0]])
     between = torch.stack([a, 0.25 * c, c]).expand(3, 3, 3)
     assert_close(triangle_distance(place, between), double([5.0, 2.0, 5.0]))
-    at_a_point = torch.zeros(3, 3, 3, dtype=torch.float64)
+    at_a_point = torch.zeros(3, 3, 3).double()
     assert_close(triangle_distance(place, at_a_point), place.norm(dim=-1))
 
 
@@ -266,5 +266,5 @@ def test_a_path_is_straight_between_its_keys():
     ],
 )
 def test_a_bad_path_is_refused(keys, message):
-    with pytest.raises(ValueError, match=message):
+    with value_error(message):
         KeyedPath(**keys)

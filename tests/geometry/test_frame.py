@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 import torch
-from shared import double, without_waits
+from shared import EYE, double, rand, seeded, value_error, without_waits
 from torch.testing import assert_close
 
 from gaussian_swaying.geometry.frame import SimFrame
@@ -14,14 +14,14 @@ UPS = [[0, 0, 1], [0, 0, -1], [0, -1, 0], [0, 1, 0], [1, 0, 0], [0.3, -0.7, 0.2]
 
 
 def _points(dtype=torch.float64):
-    return torch.rand(50, 3, generator=torch.Generator().manual_seed(1), dtype=dtype) * 4 - 1
+    return torch.rand(50, 3, generator=seeded(1), dtype=dtype) * 4 - 1
 
 
 @pytest.mark.parametrize("up", UPS)
 def test_rotation_is_proper_and_takes_up_to_z(up):
     rotation = rotation_from_z(up).T
     direction = double(up)
-    assert_close(rotation @ rotation.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-12)
+    assert_close(rotation @ rotation.T, EYE, rtol=0, atol=1e-12)
     assert float(torch.linalg.det(rotation)) == pytest.approx(1.0)
     expected = double([0.0, 0.0, 1.0])
     assert_close(rotation @ direction / direction.norm(), expected, rtol=0, atol=1e-8)
@@ -31,7 +31,7 @@ def test_rotation_is_proper_and_takes_up_to_z(up):
 
 def test_up_is_minus_y_has_a_closed_form():
     """(x, y, z) with y down becomes (x, z, -y): a quarter turn about x, exactly."""
-    frame = SimFrame(torch.zeros(3, dtype=torch.float64), rotation_from_z([0, -1, 0]).T, 2.0)
+    frame = SimFrame(torch.zeros(3).double(), rotation_from_z([0, -1, 0]).T, 2.0)
     point = torch.tensor([1.0, 2.0, 3.0])
     assert frame.point_to_sim(point).tolist() == [2.0, 6.0, -4.0]
     assert frame.direction_to_sim(point).tolist() == [1.0, 3.0, -2.0]
@@ -44,7 +44,7 @@ def test_there_and_back(up):
     placed = SimFrame.fit(_points(), up, longest_side=1.5).point_to_sim(_points())
     low, high = placed.amin(0), placed.amax(0)
     assert float((high - low).amax()) == pytest.approx(1.5, rel=1e-12)
-    assert_close(low + high, torch.zeros(3, dtype=torch.float64), rtol=0, atol=1e-12)
+    assert_close(low + high, torch.zeros(3).double(), rtol=0, atol=1e-12)
     for size in ({"longest_side": 1.0}, {"metres_per_unit": 0.01}, {}):
         frame = SimFrame.fit(_points(), up, **size)
         assert_close(frame.point_to_scene(frame.point_to_sim(_points())), _points(), rtol=0, atol=1e-12)
@@ -60,8 +60,8 @@ def test_covariances_and_gradients_follow_the_points(up):
     frame = SimFrame.fit(_points(), up, longest_side=0.7)
     covariance = torch.cov(_points().T)
     assert_close(frame.covariance_to_sim(covariance), torch.cov(frame.point_to_sim(_points()).T))
-    factor = torch.rand(5, 3, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    covariance, F = factor @ factor.mT, factor + torch.eye(3, dtype=torch.float64)
+    factor = rand(5, 3, 3, generator=seeded(2))
+    covariance, F = factor @ factor.mT, factor + EYE
     in_scene = frame.gradient_to_scene(F)
     in_metres = F @ frame.covariance_to_sim(covariance) @ F.mT
     assert_close(frame.covariance_to_sim(in_scene @ covariance @ in_scene.mT), in_metres)
@@ -126,18 +126,18 @@ def test_a_scene_far_away_keeps_its_detail(up):
 
 def test_bad_arguments():
     points = _points()
-    with pytest.raises(ValueError, match=r"either `longest_side` or `metres_per_unit`"):
+    with value_error(r"either `longest_side` or `metres_per_unit`"):
         SimFrame.fit(points, longest_side=1.0, metres_per_unit=1.0)
-    with pytest.raises(ValueError, match=r"`up` to be a direction"):
+    with value_error(r"`up` to be a direction"):
         SimFrame.fit(points, [0, 0, 0])
-    with pytest.raises(ValueError, match=r"`up` to have 3 numbers"):
+    with value_error(r"`up` to have 3 numbers"):
         SimFrame.fit(points, [0, 1])
-    with pytest.raises(ValueError, match=r"no extent .*`metres_per_unit`"):
+    with value_error(r"no extent .*`metres_per_unit`"):
         SimFrame.fit(points[:1], longest_side=1.0)
     for name in ("longest_side", "metres_per_unit"):
-        with pytest.raises(ValueError, match=name):
+        with value_error(name):
             SimFrame.fit(points, **{name: 0.0})
-    with pytest.raises(ValueError, match="points"):
+    with value_error("points"):
         SimFrame.fit(points[:, :2])
 
 

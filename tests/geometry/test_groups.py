@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from shared import randn
 
 from gaussian_swaying.geometry.groups import equal_rows
 
@@ -15,7 +16,7 @@ CASES = {
         [torch.randint(0, 2**k, (300,)) for k in (61, 55)], -1
     )[torch.randint(300, (900,))],
     "the ends of the range of integers": lambda: torch.tensor([[2**63 - 1, 0], [-(2**63), 1], [0, 1], [0, 1]]),
-    "floating point": lambda: torch.randn(40, 3, dtype=torch.float64)[torch.randint(40, (300,))],
+    "floating point": lambda: randn(40, 3)[torch.randint(40, (300,))],
     "signed zeros": lambda: torch.tensor([[0.0, 1.0], [-0.0, 1.0], [-1.0, 0.0]]),
     "one": lambda: torch.zeros(1, 2),
     "none": lambda: torch.zeros(0, 3, dtype=torch.long),

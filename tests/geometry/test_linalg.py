@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from shared import double
+from shared import EYE, double, near, peak, rand, randn, seeded
 from torch.testing import assert_close
 
 from gaussian_swaying.geometry.linalg import (
@@ -17,9 +17,9 @@ from gaussian_swaying.geometry.linalg import (
 
 
 def _matrices(device, dtype, spread=0.3, count=200):
-    generator = torch.Generator().manual_seed(1)
-    noise = torch.randn(count, 3, 3, generator=generator, dtype=torch.float64)
-    return (torch.eye(3, dtype=torch.float64) + spread * noise).to(device, dtype)
+    generator = seeded(1)
+    noise = randn(count, 3, 3, generator=generator)
+    return (EYE + spread * noise).to(device, dtype)
 
 
 def test_cofactor_and_determinant(device, dtype):
@@ -40,33 +40,33 @@ def test_polar_rotation_matches_svd(device, dtype):
     # forward error of a polar factor: eps times the condition number
     tol = 100 * torch.finfo(dtype).eps
     proper = torch.linalg.det(F) > 0
-    assert_close(R[proper], (u @ vh).to(dtype)[proper], rtol=0, atol=tol)
+    near(R[proper], (u @ vh).to(dtype)[proper], tol)
     eye = torch.eye(3, dtype=dtype, device=device).expand_as(R)
-    assert_close(R.mT @ R, eye, rtol=0, atol=tol)
-    assert_close(torch.linalg.det(R), torch.ones(len(R), dtype=dtype, device=device), rtol=0, atol=tol)
+    near(R.mT @ R, eye, tol)
+    near(torch.linalg.det(R), torch.ones(len(R), dtype=dtype, device=device), tol)
     # the nearest rotation has tr(R^T F) = s1 + s2 - s3
     inverted = ~proper
     assert int(inverted.sum()) > 5, "the test should meet inverted matrices"
     best = s[inverted] @ torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64, device=device)
     found = (R * F).double()[inverted].sum((-1, -2))
-    assert_close(found, best, rtol=0, atol=5e-3)
+    near(found, best, 5e-3)
     clear = s[inverted][:, 1] > 1.5 * s[inverted][:, 2]
-    assert_close(found[clear], best[clear], rtol=0, atol=1e-4 if dtype == torch.float32 else 1e-5)
+    near(found[clear], best[clear], 1e-4 if dtype == torch.float32 else 1e-5)
 
 
 def test_polar_rotation_is_objective(device):
     """R(Q F) = Q R(F), and R(Q) = Q."""
     F = _matrices(device, torch.float64, spread=0.2)
     Q = torch.linalg.qr(_matrices(device, torch.float64, spread=1.0))[0]
-    assert_close(polar_rotation(Q @ F, 8), Q @ polar_rotation(F, 8), rtol=0, atol=1e-12)
-    assert_close(polar_rotation(Q, 8), Q, rtol=0, atol=1e-12)
+    near(polar_rotation(Q @ F, 8), Q @ polar_rotation(F, 8), 1e-12)
+    near(polar_rotation(Q, 8), Q, 1e-12)
 
 
 def test_polar_gradient_at_identity():
     """An SVD gives NaN here; the derivative of R at I is the skew part of the perturbation."""
-    F = torch.eye(3, dtype=torch.float64).requires_grad_()
+    F = EYE.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(polar_rotation(F)[0, 1], F)
-    expected = torch.zeros(3, 3, dtype=torch.float64)
+    expected = torch.zeros(3, 3).double()
     expected[0, 1], expected[1, 0] = 0.5, -0.5
     assert_close(gradient, expected)
     G = _matrices("cpu", torch.float64, spread=0.2, count=3)
@@ -85,16 +85,16 @@ def test_polar_rotation_of_degenerate_matrices_is_finite(matrix, dtype):
 
 def test_the_largest_eigenvalue_is_the_square_of_the_largest_singular_value():
     F = _matrices("cpu", torch.float64, spread=0.5)
-    assert_close(largest_eigenvalue(F.mT @ F), torch.linalg.matrix_norm(F, 2).square(), rtol=0, atol=1e-12)
+    near(largest_eigenvalue(F.mT @ F), torch.linalg.matrix_norm(F, 2).square(), 1e-12)
 
 
 def _graded(device, dtype, decades, count=2000):
     """Random matrices with stretches between 1 and 10^-decades, many of them repeated or nearly so, half inverted."""
-    generator = torch.Generator().manual_seed(2)
-    u, v = (torch.linalg.qr(torch.randn(count, 3, 3, generator=generator, dtype=torch.float64))[0] for _ in range(2))
-    a = 10 ** (-decades * torch.rand(count, 3, generator=generator, dtype=torch.float64))
+    generator = seeded(2)
+    u, v = (torch.linalg.qr(randn(count, 3, 3, generator=generator))[0] for _ in range(2))
+    a = 10 ** (-decades * rand(count, 3, generator=generator))
     a[::3, 1] = a[::3, 0]
-    a[::4, 2] = a[::4, 1] * (1 + 1e-5 * torch.rand(len(a[::4]), generator=generator, dtype=torch.float64))
+    a[::4, 2] = a[::4, 1] * (1 + 1e-5 * rand(len(a[::4]), generator=generator))
     F = u @ a.diag_embed() @ v.mT
     F[1::2] *= -1
     return F.to(device, dtype)
@@ -117,17 +117,17 @@ def test_svd3(device, dtype, decades):
     expected = torch.linalg.svdvals(F.double())
     largest = expected[:, :1, None]
     for rotation in (u, v):
-        assert_close(rotation.mT @ rotation, _eye(dtype, device).expand_as(u), rtol=0, atol=tol)
-        assert (torch.linalg.det(rotation) - 1).abs().max() < tol
-    assert ((u @ a.diag_embed() @ v.mT - F).double() / largest).abs().max() < tol
+        near(rotation.mT @ rotation, _eye(dtype, device).expand_as(u), tol)
+        assert peak(torch.linalg.det(rotation) - 1) < tol
+    assert peak((u @ a.diag_embed() @ v.mT - F).double() / largest) < tol
     error = (a.double().abs() - expected) / expected[:, :1]
-    assert error.abs().max() < 3 * tol
+    assert peak(error) < 3 * tol
     inverted = torch.linalg.det(F.double()) < 0
     assert 100 < int(inverted.sum()) < 1900
     sure = expected[:, 2] > 10 * tol * expected[:, 0]
     assert ((a[:, 2] < 0) == inverted)[sure].all()
     assert (a[:, :2] > -tol).all()
-    assert_close(spectrum(F).rotation, u @ v.mT, rtol=0, atol=tol)
+    near(spectrum(F).rotation, u @ v.mT, tol)
 
 
 @pytest.mark.parametrize("name", ["zero", "rank one", "rank two", "identity", "reflection", "tiny"])
@@ -138,11 +138,11 @@ def test_spectrum_of_degenerate_matrices(device, dtype, name):
     u, a, v = svd3(F)
     tol = JACOBI * torch.finfo(dtype).eps
     for rotation in (u, v, spectrum(F).rotation):
-        assert_close(rotation.mT @ rotation, eye, rtol=0, atol=tol)
+        near(rotation.mT @ rotation, eye, tol)
         assert abs(float(torch.linalg.det(rotation)) - 1) < tol
-    assert_close(u @ a.diag() @ v.mT, F, rtol=tol, atol=tol * float(F.abs().max()))
+    assert_close(u @ a.diag() @ v.mT, F, rtol=tol, atol=tol * float(peak(F)))
     if name in ("identity", "tiny"):
-        assert_close(spectrum(F).rotation, eye, rtol=0, atol=tol)
+        near(spectrum(F).rotation, eye, tol)
 
 
 def test_shapes():
@@ -177,7 +177,7 @@ def test_isotropic_functions_have_exact_gradients(name, rotated):
     q = torch.linalg.qr(_matrices("cpu", torch.float64, spread=1.0, count=2))[0]
     q = q * torch.linalg.det(q)[:, None, None]
     F = (q[0] @ double(REPEATED[name]).diag() @ q[1].mT).requires_grad_()
-    p = torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
+    p = double(0.4).requires_grad_()
     assert torch.autograd.gradcheck(
         lambda x, p: from_principal(spectrum(x), lambda a: p * _log_sum(a), rotated=rotated), (F, p), atol=1e-7
     )
@@ -199,10 +199,10 @@ def test_isotropic_functions_of_inverted_matrices():
 def test_isotropic_functions_that_are_known(device, dtype):
     """The square is S S, the identity S; and the value does not depend on whether a gradient is wanted."""
     F = _matrices(device, dtype)
-    tol = JACOBI * torch.finfo(dtype).eps * float(F.abs().max()) ** 2
+    tol = JACOBI * torch.finfo(dtype).eps * float(peak(F)) ** 2
     parts = spectrum(F)
-    assert_close(from_principal(parts, lambda a: a, rotated=True), F, rtol=0, atol=tol)
-    assert_close(from_principal(parts, lambda a: a.square()), F.mT @ F, rtol=0, atol=tol)
+    near(from_principal(parts, lambda a: a, rotated=True), F, tol)
+    near(from_principal(parts, lambda a: a.square()), F.mT @ F, tol)
     assert parts.spin is None
     with_gradient = spectrum(F.clone().requires_grad_())
     assert with_gradient.spin is not None

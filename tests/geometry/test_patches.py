@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from shared import gradients, unit
+from shared import EYE, alike, double, gradients, near, rand, randn, unit
 from torch.testing import assert_close
 
 from gaussian_swaying.geometry import patches
@@ -12,7 +12,7 @@ from gaussian_swaying.geometry.patches import deform_all, deform_normal, deform_
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.kernels.language import INTERPRETED
 
-UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+UP = double([0.0, 0.0, 1.0])
 
 
 def test_deformed_normal_and_area_match_a_mapped_plane():
@@ -22,20 +22,20 @@ def test_deformed_normal_and_area_match_a_mapped_plane():
         a, b, c = x.unbind(-1)
         return torch.stack([a + 0.3 * torch.sin(2 * b) + 0.2 * c, b + 0.4 * a * a, c + 0.5 * torch.cos(a + b)], dim=-1)
 
-    points, step = torch.rand(30, 3, dtype=torch.float64), 1e-5
-    tangents = torch.linalg.qr(torch.randn(30, 3, 3, dtype=torch.float64))[0]
+    points, step = rand(30, 3), 1e-5
+    tangents = torch.linalg.qr(randn(30, 3, 3))[0]
     first, second = tangents[..., 0], tangents[..., 1]
     normal = torch.linalg.cross(first, second)
-    shift = step * torch.eye(3, dtype=torch.float64)
+    shift = step * EYE
     f = torch.stack([(curved(points + e) - curved(points - e)) / (2 * step) for e in shift], dim=-1)
     assert (torch.linalg.det(f) > 0).all()
     mapped = [(curved(points + step * t) - curved(points - step * t)) / (2 * step) for t in (first, second)]
     cross = torch.linalg.cross(*mapped)
-    assert_close(deform_normal(f, normal), cross / cross.norm(dim=-1, keepdim=True), rtol=0, atol=1e-8)
-    area = torch.rand(30, dtype=torch.float64)
+    near(deform_normal(f, normal), cross / cross.norm(dim=-1, keepdim=True), 1e-8)
+    area = rand(30)
     both = deform_patch(f, normal, area)
-    assert_close(both[0], deform_normal(f, normal), rtol=0, atol=1e-15)
-    assert_close(both[1], cross.norm(dim=-1) * area, rtol=1e-7, atol=0)
+    near(both[0], deform_normal(f, normal), 1e-15)
+    alike(both[1], cross.norm(dim=-1) * area, 1e-7)
 
 
 def test_deformed_normal_matches_the_inverse(device, dtype):
@@ -75,7 +75,7 @@ def test_everything_at_once_is_each_by_itself(device, dtype):
     assert_close(covariances, deform_covariance(f, rest))
     assert_close(normals, deform_normal(f, normal), rtol=1e-4, atol=1e-5)
     stretched = [k for k in range(len(f)) if k not in (1, 2)]
-    assert_close(rotations[stretched], polar_rotation(f)[stretched], rtol=0, atol=1e-5)
+    near(rotations[stretched], polar_rotation(f)[stretched], 1e-5)
     assert torch.isfinite(rotations).all()
     assert torch.equal(covariances[3], rest[3])
     *same, none = deform_all(f, rest, normal, rotations=False)
@@ -135,6 +135,6 @@ def test_smallest_axis(device, dtype):
 def test_gradcheck(device):
     f = gradients(20, device)[:4].requires_grad_()
     normal = unit(4, 3, device=device).requires_grad_()
-    area = torch.rand(4, device=device, dtype=torch.float64, requires_grad=True)
+    area = rand(4, device=device, requires_grad=True)
     assert torch.autograd.gradcheck(deform_normal, (f, normal))
     assert torch.autograd.gradcheck(deform_patch, (f, normal, area))

@@ -4,7 +4,7 @@ import copy
 
 import pytest
 import torch
-from shared import without_waits
+from shared import double, value_error, without_waits
 
 from gaussian_swaying import Box, Cylinder, Sphere
 from gaussian_swaying._fixed import changed
@@ -13,7 +13,7 @@ from gaussian_swaying.geometry.regions import Everything, Not, Region, Union
 
 
 def _inside(region, *points):
-    return region.contains(torch.tensor(points, dtype=torch.float64)).tolist()
+    return region.contains(double(points)).tolist()
 
 
 def test_box():
@@ -54,7 +54,7 @@ def test_batches_and_devices(region, device, dtype):
         assert inside.dtype == torch.bool
         assert inside.device.type == device.type
         assert isinstance(wrapped, Region)
-        with pytest.raises(ValueError, match="Expected `points` of shape"):
+        with value_error("Expected `points` of shape"):
             wrapped.contains(torch.rand(4, 2))
 
 
@@ -153,13 +153,11 @@ def test_selection_needs_both_region_and_opacity(device, dtype):
 
 def test_empty_selection_says_what_to_change():
     means = torch.tensor([[0.0, 1, 2], [3, 4, 5]])
-    with pytest.raises(ValueError, match="No Gaussian is selected") as error:
+    with value_error("No Gaussian is selected") as error:
         select_simulated(means, torch.tensor([0.5, 0.6]), Sphere([9, 9, 9], 1), 0.1)
     for part in ("[0.0, 1.0, 2.0] and [3.0, 4.0, 5.0]", "0 are in Sphere(center=[9, 9, 9], radius=1)", "move"):
         assert part in str(error.value)
-    with pytest.raises(ValueError, match="at least one Gaussian"):
+    with value_error("at least one Gaussian"):
         select_simulated(means[:0], torch.ones(0), None, 0.1)
-    with pytest.raises(
-        ValueError, match=r"2 are in Everything.*threshold 0\.9; .*lower the threshold .*opacity is 0\.6"
-    ):
+    with value_error(r"2 are in Everything.*threshold 0\.9; .*lower the threshold .*opacity is 0\.6"):
         select_simulated(means, torch.tensor([0.5, 0.6]), Everything(), 0.9)

@@ -2,16 +2,16 @@
 
 import pytest
 import torch
-from shared import double
+from shared import double, near, peak, rand, randn, seeded
 from torch.testing import assert_close
 
 from gaussian_swaying.geometry.rigid import centre, fitted_gradient, rigid_velocity
 from gaussian_swaying.geometry.rotations import rotation_of
 
-GENERATOR = torch.Generator().manual_seed(2)
-PLACE = torch.rand(2, 40, 3, generator=GENERATOR, dtype=torch.float64)
-VELOCITY = torch.randn(2, 40, 3, generator=GENERATOR, dtype=torch.float64)
-MASS = torch.rand(2, 40, generator=GENERATOR, dtype=torch.float64)
+GENERATOR = seeded(2)
+PLACE = rand(2, 40, 3, generator=GENERATOR)
+VELOCITY = randn(2, 40, 3, generator=GENERATOR)
+MASS = rand(2, 40, generator=GENERATOR)
 
 
 def momenta(place, velocity):
@@ -28,32 +28,32 @@ def test_momenta_and_distances_stay(dt):
     """Also in turns of several degrees in a substep: the velocity leads along the chord."""
     moved = rigid_velocity(PLACE, VELOCITY, MASS, dt)
     for found, given in zip(momenta(PLACE, moved), momenta(PLACE, VELOCITY), strict=True):
-        assert_close(found, given, rtol=0, atol=1e-11)
+        near(found, given, 1e-11)
     after = PLACE + dt * moved
-    assert_close(distances(after), distances(PLACE), rtol=0, atol=1e-12)
+    near(distances(after), distances(PLACE), 1e-12)
     for found, given in zip(momenta(after, moved), momenta(PLACE, VELOCITY), strict=True):
-        assert_close(found, given, rtol=0, atol=1e-11)
+        near(found, given, 1e-11)
 
 
 def test_a_rigid_motion_stays_as_it_is():
     turn = 1e-3 * double([1.0, 2.0, -0.5])
     middle = centre(PLACE, MASS)
     velocity = ((PLACE - middle) @ rotation_of(turn).mT + middle - PLACE) / 1e-3 + torch.tensor([0.3, 0.0, 1.0])
-    assert_close(rigid_velocity(PLACE, velocity, MASS, 1e-3), velocity, rtol=0, atol=1e-9)
+    near(rigid_velocity(PLACE, velocity, MASS, 1e-3), velocity, 1e-9)
 
 
 def test_points_without_mass_are_taken_along_and_do_not_count():
     mass = torch.where(torch.arange(40) < 20, MASS, 0.0)
     moved = rigid_velocity(PLACE, VELOCITY, mass, 1e-3)
     alone = rigid_velocity(PLACE[:, :20], VELOCITY[:, :20], mass[:, :20], 1e-3)
-    assert_close(moved[:, :20], alone, rtol=0, atol=1e-12)
+    near(moved[:, :20], alone, 1e-12)
     after = PLACE + 1e-3 * moved
-    assert_close(distances(after), distances(PLACE), rtol=0, atol=1e-12)
-    assert rigid_velocity(PLACE, VELOCITY, torch.zeros_like(mass), 1e-3).abs().max() == 0.0
+    near(distances(after), distances(PLACE), 1e-12)
+    assert peak(rigid_velocity(PLACE, VELOCITY, torch.zeros_like(mass), 1e-3)) == 0.0
 
 
 def test_the_gradient_of_an_affine_field_is_found():
-    gradient = torch.randn(2, 3, 3, generator=GENERATOR, dtype=torch.float64)
+    gradient = randn(2, 3, 3, generator=GENERATOR)
     field = PLACE @ gradient.mT + 4.0
     assert_close(fitted_gradient(PLACE, field, MASS), gradient)
 

@@ -3,21 +3,21 @@
 import math
 
 import torch
-from shared import double
+from shared import double, normalized, rand, randn, seeded
 from torch.testing import assert_close
 
 from gaussian_swaying.geometry.surface_normals import neighbour_normals
 
 
 def _sheet(count=6000, height=None):
-    generator = torch.Generator().manual_seed(0)
-    flat = torch.rand(count, 2, generator=generator, dtype=torch.float64)
+    generator = seeded(0)
+    flat = rand(count, 2, generator=generator)
     points = torch.nn.functional.pad(flat, (0, 1))
     if height is not None:
         points[:, 2] = height(flat)
-    noise = 0.1 * torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    noise = 0.1 * randn(count, 3, generator=generator)
     up = double([0.0, 0.0, 1.0])
-    return points, torch.nn.functional.normalize(up + noise, dim=-1)
+    return points, normalized(up + noise)
 
 
 def _degrees(one, two):
@@ -36,9 +36,7 @@ def test_a_wave_keeps_its_normals():
     """Planes over 16 neighbours, 1.5 cm, follow a wave of 0.5 m to its curvature times that."""
     points, _ = _sheet(height=lambda p: 0.05 * torch.sin(4 * math.pi * p[:, 0]))
     slope = 0.05 * 4 * math.pi * torch.cos(4 * math.pi * points[:, 0])
-    true = torch.nn.functional.normalize(
-        torch.stack([-slope, torch.zeros_like(slope), torch.ones_like(slope)], -1), dim=-1
-    )
+    true = normalized(torch.stack([-slope, torch.zeros_like(slope), torch.ones_like(slope)], -1))
     angle = _degrees(neighbour_normals(points, true), true)
     assert angle.median() < 1.0
     assert angle.max() < math.degrees(0.05 * (4 * math.pi) ** 2 * 0.06)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from shared import without_waits
+from shared import in_both, without_waits
 
 from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.geometry.frame import SimFrame
@@ -50,7 +50,7 @@ def test_resume(tmp_path):
     torch.testing.assert_close(*ends, rtol=0, atol=1e-3)
 
 
-@pytest.mark.parametrize("formulation", ["total", "updated"])
+@in_both
 def test_a_step_never_makes_the_host_wait(formulation):
     scene = torch.rand(500, 3, device="cuda")
     frame = SimFrame.fit(scene, up=(0.0, 1.0, 0.3), metres_per_unit=2.0)

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from shared import rand, randn, seeded
 from torch.testing import assert_close
 
 from gaussian_swaying.kernels.blocks import TranslationError
@@ -122,14 +123,14 @@ def block(request):
 
 
 def _whole(kind):
-    draw = torch.Generator().manual_seed(0)
+    draw = seeded(0)
     x, y = torch.randint(-90, 90, (2, 19), generator=draw, dtype=kind)
     x[:4], y[:4] = torch.tensor([7, -7, 7, -7]), torch.tensor([2, 2, -2, -2])
     return x, torch.where(y == 0, 3, y)
 
 
 def _real(kind):
-    x, y = torch.randn(2, 19, generator=torch.Generator().manual_seed(0), dtype=kind)
+    x, y = torch.randn(2, 19, generator=seeded(0), dtype=kind)
     x[:7] = torch.tensor([NAN, 1.0, NAN, INF, -INF, 0.0, 2.0])
     y[:7] = torch.tensor([1.0, NAN, NAN, -INF, 3.0, -0.0, 2.0])
     return x, y
@@ -190,7 +191,7 @@ def test_integers_wrap(block):
 
 def test_a_negative_zero_is_kept(block):
     zero = torch.zeros(9)
-    assert bool(torch.signbit(_applied("negative", zero, zero, torch.float32, block)).all())
+    assert torch.signbit(_applied("negative", zero, zero, torch.float32, block)).all()
 
 
 FUNCTIONS = {
@@ -225,11 +226,11 @@ def test_exp_and_log_are_within_two_units_of_the_last_place():
     """Of denormal numbers, too."""
     x = torch.cat([torch.linspace(-104, 88.72, 400_001), torch.linspace(-1, 1, 100_001), torch.tensor([1e-30, -1e-30])])
     assert _off("exponential", x).max() < 2
-    draw = torch.Generator().manual_seed(1)
-    wide, near, nearest = (torch.rand(n, generator=draw, dtype=torch.float64) for n in (400_000, 200_000, 1000))
+    draw = seeded(1)
+    wide, near, nearest = (rand(n, generator=draw) for n in (400_000, 200_000, 1000))
     x = torch.cat([(191.7 * wide - 103).exp(), 0.5 + 1.5 * near, 1 + 1e-6 * nearest.mul(6).sub(3)]).float()
     x = x[x > 0]
-    assert int((x < 2.0**-126).sum()) > 1000
+    assert (x < 2.0**-126).sum() > 1000
     assert _off("logarithm", x).max() < 2
 
 
@@ -322,7 +323,7 @@ def _reduce(x_in, sums, most, least, running, BLOCK: tl.constexpr):
 
 @pytest.mark.parametrize("kind", [torch.int32, torch.int64, torch.float32, torch.float64], ids=str)
 def test_sums_and_extremes(kind, block):
-    x = (100 * torch.randn(24, generator=torch.Generator().manual_seed(0), dtype=torch.float64)).to(kind)
+    x = (100 * randn(24, generator=seeded(0))).to(kind)
     sums, most, least = x.new_zeros(3, 24 // block)
     running = torch.zeros_like(x)
     launch(_reduce, (24 // block,))(x, sums, most, least, running, BLOCK=block)
@@ -346,7 +347,7 @@ def test_a_sum_of_truths_counts(block):
     x = torch.tensor([1.0, -1.0, 2.0, 3.0, -4.0, 5.0, -6.0, 7.0])
     out = torch.zeros(1, dtype=torch.int32)
     launch(_count_all, (1,))(x, out, BLOCK=block)
-    assert int(out) == int((x[:block] > 0).sum())
+    assert int(out) == (x[:block] > 0).sum()
 
 
 def test_sums_over_the_axis_of_one_change_nothing(block):
@@ -470,7 +471,7 @@ def test_tensors_of_truth(block):
     expected = [*(~seen).tolist(), *(seen & (torch.arange(block) > 1)).tolist(), False, True]
     assert out[: 2 * block + 2].tolist() == expected
     assert out.view(torch.uint8)[: 2 * block + 2].tolist() == list(map(int, expected))
-    assert not bool(out[2 * block + 2 :].any())
+    assert not out[2 * block + 2 :].any()
 
 
 # ---- atomic operations

@@ -219,7 +219,7 @@ def test_several_threads_work(use_threads):
     launch(_note_thread, (600,))(out, 10)
     names = [thread.name for thread in threading.enumerate()]
     assert {"kernels-1", "kernels-2"} <= set(names)
-    assert bool((out == out[0]).all())
+    assert (out == out[0]).all()
 
 
 @triton.jit
@@ -394,7 +394,7 @@ def _precise(x, out, tenth):
 
 def test_double_precision():
     """Of all numbers of a kernel that gets tensors of it and none of single precision."""
-    x, out = torch.tensor([1]), torch.zeros(1, dtype=torch.float64)
+    x, out = torch.tensor([1]), torch.zeros(1).double()
     launch(_precise, (1,))(x, out, 0.1)
     assert abs(float(out) - (1 / 3 + 0.3)) < 1e-15
     launch(_precise, (1,))(x.float(), out, 0.1)

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from shared import double, rand, randn, seeded
 
 from gaussian_swaying.kernels.derive import (
     Memory,
@@ -62,8 +63,8 @@ def loading(x):
 
 
 def _inputs(count=50):
-    draw = torch.Generator().manual_seed(0)
-    return torch.randn(5, count, generator=draw, dtype=torch.float64).requires_grad_()
+    draw = seeded(0)
+    return randn(5, count, generator=draw).requires_grad_()
 
 
 def _result(x):
@@ -86,7 +87,7 @@ def test_a_device_function_is_its_definition_in_torch():
 
 
 def test_the_adjoint_is_the_gradient():
-    x, bar = _inputs(), torch.randn(3, 50, dtype=torch.float64)
+    x, bar = _inputs(), randn(3, 50)
     (expected,) = torch.autograd.grad((_result(x) * bar).sum(), x)
     adjoint = vjp(formula, {"a": 3, "s": 0}, ("a", "s"), {"p": (2.0,), "SQUARED": True})
     by_a, by_s = on_tensors(adjoint)(tuple(x.detach()[:3]), x.detach()[3], tuple(bar))
@@ -123,7 +124,7 @@ def test_a_tangent_is_the_transpose():
         return tangent(results, a, t), gradient(results, a, (t[0], t[1]))
 
     function = on_tensors(device_function("both", {"a": 3, "t": 3}, both))
-    a, t = (torch.rand(3, 20, dtype=torch.float64) + 0.5 for _ in range(2))
+    a, t = (rand(3, 20) + 0.5 for _ in range(2))
     forward = function(tuple(a), tuple(t))[0]
     _, expected = torch.func.jvp(lambda a: torch.stack([a[0] * a[1] / a[2], a[0].sqrt()]), (a,), (t,))
     torch.testing.assert_close(torch.stack(forward), expected)
@@ -148,8 +149,8 @@ def test_a_divided_difference_does_not_cancel():
         return tl.where(x > 0.6, 2 * x, x + 0.6)
 
     function = on_tensors(device_function("slope", {"x": 0, "y": 0}, slope))
-    x = torch.tensor([0.7, 0.7, 0.3, 0.7, 2.0], dtype=torch.float64)
-    y = x + torch.tensor([0.5, 1e-9, 0.1, 0.0, -1.7], dtype=torch.float64)
+    x = double([0.7, 0.7, 0.3, 0.7, 2.0])
+    y = x + double([0.5, 1e-9, 0.1, 0.0, -1.7])
 
     def f(x, y):
         return (x * x + 3 * y).sqrt() / x.clamp(min=0.5) - torch.where(x > 0.6, 2 * x, x + 0.6)
@@ -168,9 +169,9 @@ def looked_up(table, x, mask, STEP: tl.constexpr):
 
 
 def test_tables_are_looked_up():
-    x, table = torch.tensor([0.5, 1.2, 7.0], dtype=torch.float64), torch.arange(5)
+    x, table = double([0.5, 1.2, 7.0]), torch.arange(5)
     found = torch.stack(on_tensors(looked_up)(Memory(table), x, x < 3, 2))
-    assert torch.equal(found, torch.tensor([[0.0, 2.0, -1.0], [1.0, 3.0, -1.0]], dtype=torch.float64))
+    assert torch.equal(found, double([[0.0, 2.0, -1.0], [1.0, 3.0, -1.0]]))
 
 
 def test_the_gradient_of_a_length_is_zero_at_zero():

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from shared import value_error
 from torch.testing import assert_close
 
 from gaussian_swaying.metrics import nearest
@@ -122,5 +123,5 @@ def test_a_position_that_is_nan_is_not_hidden(count):
     ],
 )
 def test_bad_input(source, target, message):
-    with pytest.raises(ValueError, match=message):
+    with value_error(message):
         chamfer_distance(torch.rand(source), torch.rand(target))

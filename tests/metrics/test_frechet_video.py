@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from shared import double
+from shared import double, randn, value_error
 from torch import Tensor, nn
 from torch.testing import assert_close
 
@@ -54,7 +54,7 @@ def make(tmp_path):
 
 
 def _covariance(size):
-    root = torch.randn(size, size, dtype=torch.float64)
+    root = randn(size, size)
     return root @ root.mT
 
 
@@ -62,7 +62,7 @@ def _covariance(size):
 
 
 def test_equal_gaussians_have_no_distance(device):
-    mean, cov = torch.randn(20, dtype=torch.float64, device=device), _covariance(20).to(device)
+    mean, cov = randn(20, device=device), _covariance(20).to(device)
     # eigenvalues are good to eps |S|^2, whose root is taken where they vanish: 20 sqrt(eps) |S| at most
     bound = 20 * math.sqrt(torch.finfo(torch.float64).eps) * float(cov.norm())
     assert 0 <= frechet_distance(mean, cov, mean, cov) < bound
@@ -89,8 +89,8 @@ def test_covariances_that_do_not_commute():
 
 def test_invariance_under_rotation_and_order():
     cov1, cov2 = _covariance(6), _covariance(6)
-    mean1, mean2 = torch.randn(2, 6, dtype=torch.float64)
-    turn = torch.linalg.qr(torch.randn(6, 6, dtype=torch.float64)).Q
+    mean1, mean2 = randn(2, 6)
+    turn = torch.linalg.qr(randn(6, 6)).Q
     one = frechet_distance(mean1, cov1, mean2, cov2)
     assert_close(frechet_distance(mean2, cov2, mean1, cov1), one)
     turned = frechet_distance(turn @ mean1, turn @ cov1 @ turn.mT, turn @ mean2, turn @ cov2 @ turn.mT)
@@ -100,7 +100,7 @@ def test_invariance_under_rotation_and_order():
 def test_singular_covariances():
     """Fewer samples than dimensions: along u and v, tr sqrt(A B) = |u.v| s t for A = s^2 u u^T, B = t^2 v v^T."""
     size, s, t, angle = 50, 3.0, 0.5, 0.7
-    u, v = torch.zeros(2, size, dtype=torch.float64)
+    u, v = torch.zeros(2, size).double()
     u[0], v[0], v[1] = 1.0, math.cos(angle), math.sin(angle)
     found = frechet_distance(u, s**2 * torch.outer(u, u), u, t**2 * torch.outer(v, v))
     # 49 eigenvalues that should be 0 are up to eps (s t)^2, and their roots are added
@@ -117,7 +117,7 @@ def test_singular_covariances():
     ],
 )
 def test_shapes_that_do_not_fit(shapes, name):
-    with pytest.raises(ValueError, match=f"Expected `{name}` of shape"):
+    with value_error(f"Expected `{name}` of shape"):
         frechet_distance(*(torch.ones(shape) for shape in shapes))
 
 
@@ -205,26 +205,26 @@ def test_the_network_follows_the_metric(make):
 
 
 def test_missing_weights(tmp_path):
-    with pytest.raises(ValueError, match=r"There is no file .*i3d\.pt: set `weights` .* none is downloaded"):
+    with value_error(r"There is no file .*i3d\.pt: set `weights` .* none is downloaded"):
         FrechetVideoDistance(tmp_path / "i3d.pt")
 
 
 def test_weights_that_are_not_torchscript(tmp_path):
     (tmp_path / "i3d.pt").write_bytes(b"not a network")
-    with pytest.raises(ValueError, match=r"i3d\.pt cannot be read as TorchScript"):
+    with value_error(r"i3d\.pt cannot be read as TorchScript"):
         FrechetVideoDistance(tmp_path / "i3d.pt")
 
 
 @pytest.mark.parametrize("network", [WrongShape(), WrongRows()])
 def test_network_with_another_output(make, network):
     metric = make(network)
-    with pytest.raises(ValueError, match=r"to return features of shape \(3, D\) for 3 clips, but got"):
+    with value_error(r"to return features of shape \(3, D\) for 3 clips, but got"):
         metric.update(torch.rand(6, 3, 8, 8), real=True)
     assert metric.protocol()["real_clips"] == 0
 
 
 def test_video_shorter_than_a_clip(make):
-    with pytest.raises(ValueError, match="A video has 3 frames, but a clip needs 4"):
+    with value_error("A video has 3 frames, but a clip needs 4"):
         make(clip_length=4).update(torch.rand(3, 3, 8, 8), real=True)
 
 
@@ -235,7 +235,7 @@ def test_too_few_clips(make, real, fake, named):
         if count:
             metric.update(torch.rand(count, 3, 8, 8), real=is_real)
     message = f"at least 2 {named} clips, but there are {min(real, fake) // 2}"
-    with pytest.raises(ValueError, match=message):
+    with value_error(message):
         metric.compute()
 
 
@@ -249,14 +249,14 @@ def test_too_few_clips(make, real, fake, named):
     ],
 )
 def test_bad_options(make, options, message):
-    with pytest.raises(ValueError, match=message):
+    with value_error(message):
         make(**options)
 
 
 @pytest.mark.parametrize("shape", [(4, 8, 8, 3), (4, 8, 8), (1, 1, 4, 3, 8, 8)])
 def test_bad_videos(make, shape):
-    with pytest.raises(ValueError, match="Expected `video` of shape"):
+    with value_error("Expected `video` of shape"):
         make().update(torch.rand(shape), real=True)
     for changed in (-0.1, 1.1):
-        with pytest.raises(ValueError, match="values from 0 to 1, but they range from"):
+        with value_error("values from 0 to 1, but they range from"):
             make().update(torch.full((4, 3, 8, 8), changed), real=True)

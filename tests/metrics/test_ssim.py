@@ -1,7 +1,7 @@
 """Structural similarity against torchmetrics."""
 
-import pytest
 import torch
+from shared import rand, value_error
 from torch.testing import assert_close
 from torchmetrics.functional.image import structural_similarity_index_measure
 
@@ -9,7 +9,7 @@ from gaussian_swaying.metrics.ssim import ssim_map
 
 
 def _pictures():
-    x = torch.rand(24, 31, 3, dtype=torch.float64)
+    x = rand(24, 31, 3)
     return x, (x + 0.2 * torch.randn_like(x)).clamp(0, 1)
 
 
@@ -26,7 +26,7 @@ def test_ssim_equals_torchmetrics(device):
 
 def test_ssim_of_equal_pictures_is_one_and_padding_keeps_the_size():
     x, y = _pictures()
-    assert_close(ssim_map(x, x), torch.ones(14, 21, 3, dtype=torch.float64))
+    assert_close(ssim_map(x, x), torch.ones(14, 21, 3).double())
     for padding in ("reflect", "zeros"):
         padded = ssim_map(x, y, padding)
         assert padded.shape == x.shape
@@ -37,5 +37,5 @@ def test_ssim_of_equal_pictures_is_one_and_padding_keeps_the_size():
 
 def test_ssim_refuses():
     x, y = _pictures()
-    with pytest.raises(ValueError, match=r"at least 11 x 11 pixels, but got 31 x 10"):
+    with value_error(r"at least 11 x 11 pixels, but got 31 x 10"):
         ssim_map(x[:10], y[:10])

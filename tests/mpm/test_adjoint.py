@@ -6,11 +6,10 @@ from itertools import cycle
 import pytest
 import torch
 from catalogue import ELASTIC
-from shared import solid
+from shared import double, normalized, peak, rand, randn, seeded, solid, up_to, value_error
 
 from gaussian_swaying import (
     AeroForce,
-    Box,
     MPMSolver,
     PinnedPoints,
     PinnedRegion,
@@ -33,19 +32,19 @@ def _one_width(monkeypatch):
 
 
 def _random(seed, *shape):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=WIDE)
+    return randn(*shape, generator=seeded(seed))
 
 
 def _error(found, expected):
     """Largest difference, relative to the largest value."""
-    return float((found.to(expected) - expected).abs().max()) / max(float(expected.abs().max()), 1e-30)
+    return float(peak(found.to(expected) - expected)) / max(float(peak(expected)), 1e-30)
 
 
 def _patches(count, dtype):
     """Up to five patches for each point, of all directions, and none for every fourth."""
     point = torch.arange(5 * count) % count
     point = point[point % 4 > 0]
-    normal = torch.nn.functional.normalize(_random(3, len(point), 3), dim=-1)
+    normal = normalized(_random(3, len(point), 3))
     area = 0.005 * (1.5 + _random(6, len(point)).tanh())
     return Patches(normal.to(dtype), area.to(dtype), point, count)
 
@@ -55,9 +54,9 @@ DX, DT = 0.1, 1e-3
 
 def _place(batch=()):
     """A sheet whose outermost nodes have mass enough: the inverse of a vanishing mass would make all errors large."""
-    axes = [DX * torch.arange(*axis, dtype=WIDE) for axis in ((1.0, 3.1, 0.5), (1.0, 2.1, 0.5), (1.0, 1.1, 1.0))]
+    axes = [DX * torch.arange(*axis).double() for axis in ((1.0, 3.1, 0.5), (1.0, 2.1, 0.5), (1.0, 1.1, 1.0))]
     place = torch.cartesian_prod(*axes)
-    return place + 2e-3 * torch.rand(*batch, *place.shape, generator=torch.Generator().manual_seed(0), dtype=WIDE)
+    return place + 2e-3 * rand(*batch, *place.shape, generator=seeded(0))
 
 
 def _gradients(
@@ -80,9 +79,9 @@ def _gradients(
     values = {
         "velocity": _random(1, *place.shape),
         "youngs_modulus": 1e4 * (1.2 + 0.2 * _random(5, *place.shape[:-1]).tanh()),
-        "poisson_ratio": torch.tensor(0.3, dtype=WIDE),
+        "poisson_ratio": double(0.3),
         "density": 80 * (1.2 + 0.2 * _random(7, *place.shape[:-1]).tanh()),
-        "volume": torch.tensor(1e-4, dtype=WIDE),
+        "volume": double(1e-4),
     }
     if bends:
         values["bending"] = 1e-3 * (1.2 + 0.2 * _random(10, *place.shape[:-1]).tanh())
@@ -111,8 +110,8 @@ def _gradients(
         aero = AeroForce(0.6, 0.4, C_L=0.2, **dict(wind)).to(device)
         leaves = {"flow": field.flows, "C_D": aero.C_D, "C_F": aero.C_F, "C_L": aero.C_L}
         values |= {name: leaf.requires_grad_() for name, leaf in leaves.items()}
-        normal = torch.nn.functional.normalize(_random(3, *place.shape), dim=-1).to(device, dtype)
-        area = 0.02 * torch.rand(place.shape[:-1], generator=torch.Generator().manual_seed(4), dtype=WIDE)
+        normal = normalized(_random(3, *place.shape)).to(device, dtype)
+        area = 0.02 * rand(place.shape[:-1], generator=seeded(4))
         patches = [_patches(place.shape[-2], dtype).to(device)] if groups else [normal, area.to(device, dtype)]
         forces = [WindForce(aero, field, *patches)]
     state = solver.rollout(state, DT, steps, forces, 2)
@@ -137,7 +136,7 @@ def _compare(device, law, left_out=(), **settings):
     assert found.keys() == expected.keys()
     names = [name for name in expected if name not in left_out]
     for name in names:
-        assert float(expected[name].abs().max()) > 0, name
+        assert peak(expected[name]) > 0, name
     errors = {name: _error(found[name], expected[name]) for name in names}
     if not all(error <= tolerance for error in errors.values()):
         torchs = _gradients(device, dtype, "torch", law, **settings)
@@ -146,7 +145,7 @@ def _compare(device, law, left_out=(), **settings):
 
 
 def _pin(kind):
-    return PinnedRegion(Box([None, None, None], [0.12, None, None]), kind=kind)
+    return PinnedRegion(up_to(x=0.12), kind=kind)
 
 
 SEVERAL = [ELASTIC["corotated"], ELASTIC["neo-hookean"]]
@@ -166,7 +165,7 @@ ROLLOUTS = {  # by everything that a fit may seek; with 5 substeps, segments of 
         SEVERAL[0],
         {
             "boundaries": [
-                PinnedRegion(Box([None, None, None], [0.12, 0.12, None])),
+                PinnedRegion(up_to(x=0.12, y=0.12)),
                 PinnedPoints([[0.15, 0.15, 0.07]]),
             ]
         },
@@ -207,7 +206,7 @@ def test_gradients_where_cells_are_cut(kernel_device, monkeypatch):
 
 def _refused(solver, state, forces=(), match=""):
     """The kernels say why they do not compute a gradient."""
-    with pytest.raises(ValueError, match=f"`transfer: kernels` has no gradients here, because .*{match}"):
+    with value_error(f"`transfer: kernels` has no gradients here, because .*{match}"):
         solver.rollout(state, DT, 1, list(forces))
 
 
@@ -215,7 +214,7 @@ def _free(device, **settings):
     """A solver of a sheet and its first state, whose nodal velocity requires a gradient."""
     place = _place().to(device, torch.float32)
     points = solid(place, 1e-4, 80.0)
-    solver = MPMSolver(dx=DX, transfer="kernels", **settings)
+    solver = MPMSolver(DX, transfer="kernels", **settings)
     state = solver.init_state(points)
     return solver, state.replace(node_velocity=state.node_velocity.clone().requires_grad_())
 
@@ -240,7 +239,7 @@ def test_kernels_refuse_what_they_do_not_cover(kernel_device):
     _refused(solver, leaf, match="inputs of their own")
     alone = leaf.replace(node_velocity=state.node_velocity.detach())
     _refused(solver, alone, match="the nodal ones do not")
-    late = PinnedRegion(Box([None, None, None], [0.12, None, None]), start=DT)
+    late = PinnedRegion(up_to(x=0.12), start=DT)
     _refused(*_free(kernel_device, boundaries=[late]), match="pins that hold all the time")
     floor = Plane([0.0, 0.0, 0.0], [0.0, 0.0, 1.0])
     ball = BallObstacle([0.2, 0.15, -0.1], 0.05)

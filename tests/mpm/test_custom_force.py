@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from shared import double
 
 ROOT = Path(__file__).parents[2]
 
@@ -41,5 +42,5 @@ def test_a_wrong_force_is_found(module):
 
 def test_the_force_changes_with_time(module):
     vortex = module.PointVortex([0.0, 0.0], 2.0 * torch.pi, period=1.0)
-    found = vortex.turn(torch.tensor([0.0, 0.25, 0.75], dtype=torch.float64))
-    torch.testing.assert_close(found, torch.tensor([1.0, 1.5, 0.5], dtype=torch.float64))
+    found = vortex.turn(double([0.0, 0.25, 0.75]))
+    torch.testing.assert_close(found, double([1.0, 1.5, 0.5]))

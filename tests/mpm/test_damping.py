@@ -6,20 +6,17 @@ from itertools import pairwise
 
 import pytest
 import torch
-from shared import solid
+from shared import EYE, ZERO, double, in_both, near, peak, rand, randn, solid, up_to, value_error
 from torch.testing import assert_close
 
-from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion
+from gaussian_swaying import MaterialPoints, MPMSolver, PinnedRegion
 from gaussian_swaying.mpm.damping import damped_substep, decay_rate, kelvin_voigt_pk1
 from gaussian_swaying.mpm.timestep import cfl_number, stable_limit, substeps_per_frame, wave_speed
 from gaussian_swaying.mpm.transfer import bspline_stencil
 
-FORMULATIONS = ["total", "updated"]
-EYE = torch.eye(3, dtype=torch.float64)
-
 
 def _bar(counts, spacing, e=2e4, nu=0.0):
-    axes = [(torch.arange(n, dtype=torch.float64) + 0.5) * spacing for n in counts]
+    axes = [(torch.arange(n).double() + 0.5) * spacing for n in counts]
     position = torch.cartesian_prod(*axes)
     return solid(position, spacing**3, 100.0, e, nu)
 
@@ -32,9 +29,9 @@ def test_stress_is_the_rate_of_the_saint_venant_kirchhoff_stress():
 
     So it removes energy, keeps angular momentum, and turns with the body.
     """
-    F = EYE + 0.3 * torch.randn(20, 3, 3, dtype=torch.float64)
-    rate = torch.randn(20, 3, 3, dtype=torch.float64)
-    mu, lam = 1 + torch.rand(2, 20, dtype=torch.float64)
+    F = EYE + 0.3 * randn(20, 3, 3)
+    rate = randn(20, 3, 3)
+    mu, lam = 1 + rand(2, 20)
 
     def second(t):
         G = F + t * rate
@@ -48,13 +45,13 @@ def test_stress_is_the_rate_of_the_saint_venant_kirchhoff_stress():
 # ---- whole steps
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_a_turn_is_not_damped(formulation):
     """A free block that spins, with damping so strong that every vibration is overdamped."""
     points = _bar((6, 6, 6), 0.4 / 6, e=5e3, nu=0.3)
-    solver = MPMSolver(dx=0.1, formulation=formulation, gravity=(0, 0, 0), stiffness_damping=0.02)
+    solver = MPMSolver(0.1, formulation, gravity=ZERO, stiffness_damping=0.02)
     centre = points.position.mean(0)
-    spin = torch.tensor([[0, -0.8, -0.5], [0.8, 0, -0.3], [0.5, 0.3, 0]], dtype=torch.float64)
+    spin = double([[0, -0.8, -0.5], [0.8, 0, -0.3], [0.5, 0.3, 0]])
     state = solver.init_state(points, (points.position - centre) @ spin.T, margin=6)
     affine = spin.expand_as(state.affine)
     if formulation == "updated":
@@ -65,14 +62,14 @@ def test_a_turn_is_not_damped(formulation):
     before = solver.momenta(state)["angular"]
     steps = solver.substeps(state, 0.25)
     state = solver.rollout(state, 0.25 / steps, steps)
-    assert_close(solver.momenta(state)["angular"], before, rtol=0, atol=1e-11 * float(before.norm()))
+    near(solver.momenta(state)["angular"], before, 1e-11 * float(before.norm()))
     # the centrifugal strain is rho omega² L² / (8 E) = 4e-4
     turn = torch.linalg.matrix_exp(0.25 * spin)
-    assert_close(state.F_elastic, turn.expand_as(state.F_elastic), rtol=0, atol=2e-3)
+    near(state.F_elastic, turn.expand_as(state.F_elastic), 2e-3)
 
 
 @pytest.mark.slow(gate=["updated"])
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_damping_in_proportion_to_frequency(formulation):
     """Energy ~ exp(-beta omega² t), four periods of 0.056 s; and dissipated energy never comes back."""
     points = _bar((8, 2, 2), 0.05)
@@ -80,7 +77,7 @@ def test_damping_in_proportion_to_frequency(formulation):
     velocity[:, 0] = 0.05 * torch.cos(math.pi * points.position[:, 0] / 0.4)
     left = {}
     for beta in (0.0, 5e-4, 1e-3):
-        solver = MPMSolver(dx=0.1, formulation=formulation, gravity=(0, 0, 0), stiffness_damping=beta)
+        solver = MPMSolver(0.1, formulation, gravity=ZERO, stiffness_damping=beta)
         state = solver.init_state(points, velocity)
         energy = []
         for _ in range(224):  # four periods
@@ -90,7 +87,7 @@ def test_damping_in_proportion_to_frequency(formulation):
         if beta:
             # an elastic energy of half a substep ago beside a kinetic one of now: a ripple of omega dt
             smooth = torch.tensor(energy).unfold(0, 28, 28).mean(-1)
-            assert bool((smooth.diff() < 0).all())
+            assert (smooth.diff() < 0).all()
     small, large = left[5e-4] - left[0.0], left[1e-3] - left[0.0]
     # the means are three periods apart; lumped mass and half cells at its ends change omega by a few per cent
     assert small == pytest.approx(-5e-4 * (2 * math.pi / 0.056) ** 2 * 0.168, rel=0.2)
@@ -109,7 +106,7 @@ def test_damped_substep_is_the_root_of_its_criterion():
             assert dt**2 + 2 * time * dt == pytest.approx(limit**2, rel=1e-12)
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_solver_divides_a_frame_by_the_damped_substep(formulation):
     """Its Courant number is that of the equally stable undamped substep: `cfl` for the longest substep."""
     points = _bar((3, 3, 3), 0.1, nu=0.3)
@@ -117,7 +114,7 @@ def test_solver_divides_a_frame_by_the_damped_substep(formulation):
     undamped = float(stable_limit(points, 0.1).amin())
     counts = []
     for beta in (0.0, 1e-4, 1e-3, 1e-2):
-        solver = MPMSolver(dx=0.1, formulation=formulation, cfl=0.4, stiffness_damping=beta)
+        solver = MPMSolver(0.1, formulation, cfl=0.4, stiffness_damping=beta)
         state = solver.init_state(points)
         longest = damped_substep(0.4 / cells, beta)
         counts.append(solver.substeps(state, 0.04))
@@ -126,8 +123,8 @@ def test_solver_divides_a_frame_by_the_damped_substep(formulation):
         assert float(solver.cfl_number(state, 0.04 / counts[-1])) <= 0.4 * (1 + 1e-9)
         assert solver.stable_substep() == pytest.approx(damped_substep(undamped, beta), rel=1e-9)
         substep = 1.01 * solver.stable_substep()
-        fixed = MPMSolver(dx=0.1, formulation=formulation, substep=substep, stiffness_damping=beta)
-        with pytest.raises(ValueError, match=r"fixed `substep` of .* longer than the stable one"):
+        fixed = MPMSolver(0.1, formulation, substep=substep, stiffness_damping=beta)
+        with value_error(r"fixed `substep` of .* longer than the stable one"):
             fixed.substeps(fixed.init_state(points), 0.04)
     assert counts == sorted(set(counts))
     assert counts[-1] > 4 * counts[0]
@@ -140,8 +137,8 @@ def _swing(stiffer, rate=0.0, beta=0.0):
     """Frequency [rad/s] and damping ratio of the lowest bending mode, from the logarithmic decrement; the energies."""
     points = _bar((30, 3, 3), 0.1 / 3, e=2e4 * stiffer**2)
     points = replace(points, damping=torch.full_like(points.mass, rate)) if rate else points
-    pin = PinnedRegion(Box([None] * 3, [0.2, None, None]), kind="clamp")
-    solver = MPMSolver(dx=0.1, gravity=(0, 0, 0), boundaries=[pin], stiffness_damping=beta)
+    pin = PinnedRegion(up_to(x=0.2), kind="clamp")
+    solver = MPMSolver(0.1, gravity=ZERO, boundaries=[pin], stiffness_damping=beta)
     x = 1.875104 * ((points.position[:, 0] - 0.2) / 0.8).clamp(min=0)
     shape = torch.cosh(x) - torch.cos(x) - 0.734096 * (torch.sinh(x) - torch.sin(x))  # clamped-free, textbook
     velocity = torch.zeros_like(points.position)
@@ -151,7 +148,7 @@ def _swing(stiffer, rate=0.0, beta=0.0):
         state = solver.rollout(state, dt, 20)
         height.append(float((points.mass * shape * (state.position - points.position)[:, 2]).sum()))
         energy.append(float(sum(solver.energies(state).values())))
-    found = torch.tensor(height, dtype=torch.float64).abs()
+    found = double(height).abs()
     peaks = ((found[1:-1] > found[:-2]) & (found[1:-1] >= found[2:])).nonzero()[:, 0] + 1
     low, top, high = (found[peaks + k] for k in (-1, 0, 1))
     bend = low - 2 * top + high  # a parabola through the largest three
@@ -179,7 +176,7 @@ def test_each_part_has_its_own_damping():
     far = replace(other, position=other.position + 2.0, damping=torch.full_like(other.mass, 3.0))
     points = MaterialPoints.join([one, far])
     assert points.damping[: one.count].tolist() == [0.0] * one.count
-    solver = MPMSolver(dx=0.1, gravity=(0, 0, 0))
+    solver = MPMSolver(0.1, gravity=ZERO)
     velocity = torch.ones_like(points.position)
     state = solver.rollout(solver.init_state(points, velocity), 1e-3, 100)
     expected = torch.exp(-0.1 * points.damping)[:, None].expand(-1, 3)
@@ -190,10 +187,10 @@ def test_each_part_has_its_own_damping():
 
 def test_damping_of_the_material_is_refused_in_updated_and_below_zero():
     bar = _bar((3, 3, 3), 0.1)
-    with pytest.raises(ValueError, match=r"`material.damping_ratio` sets, needs `solver.formulation: total`"):
-        MPMSolver(dx=0.1, formulation="updated").init_state(replace(bar, damping=torch.ones_like(bar.mass)))
+    with value_error(r"`material.damping_ratio` sets, needs `solver.formulation: total`"):
+        MPMSolver(0.1, "updated").init_state(replace(bar, damping=torch.ones_like(bar.mass)))
     numbers = {"volume": 1e-3, "density": 1.0, "youngs_modulus": 1.0, "poisson_ratio": 0.3}
-    with pytest.raises(ValueError, match="`damping` not to be negative"):
+    with value_error("`damping` not to be negative"):
         MaterialPoints.create(bar.position, damping=-1.0, **numbers)
 
 
@@ -209,7 +206,7 @@ def _points(position, e=1e4, nu=0.3, density=100.0):
     [(2e6, 0.4, 300, 119.5), (1e4, 0.4, 15, 37.8), (5e5, 0.4, 200, 73.2), (1e4, 0.3, 20, 25.9), (3e3, 0.3, 20, 14.2)],
 )
 def test_wave_speeds_of_the_papers_scenes(e, nu, density, expected):
-    speed = wave_speed(_points(torch.zeros(1, 3, dtype=torch.float64), e, nu, density))
+    speed = wave_speed(_points(torch.zeros(1, 3).double(), e, nu, density))
     assert float(speed[0]) == pytest.approx(expected, abs=0.05)
 
 
@@ -232,7 +229,7 @@ def test_limit_is_sharp_for_one_particle(damping):
     position = torch.full((1, 3), 0.05001, dtype=torch.float64)
     points = _points(position, nu=0.3)
     undamped = float(stable_limit(points, 0.1).amin())
-    solver = MPMSolver(dx=0.1, gravity=(0, 0, 0), stiffness_damping=damping * undamped)
+    solver = MPMSolver(0.1, gravity=ZERO, stiffness_damping=damping * undamped)
     limit = damped_substep(undamped, solver.stiffness_damping)
     assert (limit < undamped) == (damping > 0)
     for factor, stable in ((0.98, True), (1.02 if damping == 0 else 1.05, False)):
@@ -241,52 +238,52 @@ def test_limit_is_sharp_for_one_particle(damping):
         mode = torch.zeros_like(state.node_velocity)
         mode[stencil.node[0]] = 1e-9 * (stencil.basis[0, 1:4] / stencil.basis[0, 0]).T
         end = solver.rollout(state.replace(node_velocity=mode), factor * limit, 400, check=False)
-        strain = float((end.F_elastic - torch.eye(3, dtype=torch.float64)).abs().max())
+        strain = float(peak(end.F_elastic - EYE))
         assert (strain < 1e-6) == stable, (factor, strain)
 
 
 def test_updated_is_unstable_well_above_the_limit():
     points = _points(torch.full((1, 3), 0.05, dtype=torch.float64))
-    solver = MPMSolver(dx=0.1, formulation="updated", gravity=(0, 0, 0))
+    solver = MPMSolver(0.1, "updated", gravity=ZERO)
     state = solver.init_state(points)
-    state = state.replace(affine=1e-6 * torch.eye(3, dtype=torch.float64)[None])
+    state = state.replace(affine=1e-6 * EYE[None])
     for factor, stable in ((0.98, True), (2.0, False)):
         end = solver.rollout(state, factor * solver.stable_substep(), 400, check=False)
-        strain = float((end.F_elastic - torch.eye(3, dtype=torch.float64)).abs().max())
+        strain = float(peak(end.F_elastic - EYE))
         assert (strain < 1e-5) == stable, (factor, strain)
 
 
-@pytest.mark.parametrize("formulation", ["total", "updated"])
+@in_both
 @pytest.mark.parametrize(("nu", "damping"), [(0.0, 0.0), (0.3, 0.0), (0.45, 0.0), (0.0, 2.0), (0.45, 2.0)])
 def test_random_bodies_are_stable_below_the_limit(formulation, nu, damping):
     """With stiffness damping, in undamped limits, the damped one."""
-    points = _points(0.15 * torch.rand(40, 3, dtype=torch.float64), nu=nu)
+    points = _points(0.15 * rand(40, 3), nu=nu)
     time = damping * float(stable_limit(points, 0.05).amin())
-    solver = MPMSolver(dx=0.05, formulation=formulation, gravity=(0, 0, 0), stiffness_damping=time)
+    solver = MPMSolver(0.05, formulation, gravity=ZERO, stiffness_damping=time)
     kick = 1e-6 * torch.randn_like(points.position)
     state = solver.init_state(points, kick)
     end = solver.rollout(state, 0.98 * solver.stable_substep(), 150)
-    assert float(end.velocity.abs().max()) < 2 * float(kick.abs().max())
+    assert peak(end.velocity) < 2 * peak(kick)
 
 
 def test_cfl_of_0_47_never_exceeds_the_limit():
     for nu in (0.0, 0.2, 0.4, 0.49, 0.4999):
-        points = _points(torch.zeros(1, 3, dtype=torch.float64), nu=nu)
+        points = _points(torch.zeros(1, 3).double(), nu=nu)
         assert 0.47 / float(wave_speed(points)) <= float(stable_limit(points, 1.0))
 
 
 def test_stretch_shortens_the_substep():
-    points = _points(torch.zeros(1, 3, dtype=torch.float64))
-    stretched = torch.diag(torch.tensor([2.0, 2.0, 0.5], dtype=torch.float64))[None]
+    points = _points(torch.zeros(1, 3).double())
+    stretched = torch.diag(double([2.0, 2.0, 0.5]))[None]
     assert float(stable_limit(points, 1.0, stretched)) < 0.5 * float(stable_limit(points, 1.0))
     assert float(wave_speed(points, stretched)) > 1.5 * float(wave_speed(points))
     assert float(wave_speed(points, stretched, spatial=True)) == pytest.approx(2 * float(wave_speed(points, stretched)))
 
 
 def test_rounding_does_not_lengthen_a_fixed_substep_beyond_the_stable_one():
-    points = _points(torch.rand(20, 3, dtype=torch.float64))
-    solver = MPMSolver(dx=0.1)
+    points = _points(rand(20, 3))
+    solver = MPMSolver(0.1)
     solver.init_state(points)
     limit = solver.stable_substep()
-    fixed = MPMSolver(dx=0.1, substep=limit)
+    fixed = MPMSolver(0.1, substep=limit)
     assert fixed.substeps(fixed.init_state(points), 1.49 * limit) == 2

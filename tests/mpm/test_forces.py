@@ -8,17 +8,16 @@ from pathlib import Path
 
 import pytest
 import torch
-from shared import solid, unit
+from shared import ZERO, beyond, double, in_both, longest, near, peak, rand, randn, seeded, solid, unit, value_error
 from torch.testing import assert_close
 
-from gaussian_swaying import AeroForce, Box, Force, MPMSolver, PinnedRegion, SpatialWind, WindField, WindForce
+from gaussian_swaying import AeroForce, Force, MPMSolver, PinnedRegion, SpatialWind, WindField, WindForce
 from gaussian_swaying.mpm.forces import FunctionForce, as_forces
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "forces.md").read_text()
 EXAMPLES = re.findall(r"```python\n(.*?)```\n\n```text\n(.*?)```", PAGE, flags=re.DOTALL)
 DT = 1e-3
-FORMULATIONS = ["total", "updated"]
 
 
 class Spring(Force):
@@ -28,7 +27,7 @@ class Spring(Force):
 
     def __init__(self, stiffness=3.0, resistance=None):
         super().__init__()
-        self.stiffness = torch.nn.Parameter(torch.tensor(float(stiffness), dtype=torch.float64))
+        self.stiffness = torch.nn.Parameter(double(float(stiffness)))
         self.resistance = resistance
 
     def forward(self, state):
@@ -40,11 +39,11 @@ class Spring(Force):
 
 
 def _setting(formulation="total", batch=(), **options):
-    generator = torch.Generator().manual_seed(0)
-    position = 0.3 * torch.rand(*batch, 20, 3, dtype=torch.float64, generator=generator)
+    generator = seeded(0)
+    position = 0.3 * rand(*batch, 20, 3, generator=generator)
     points = solid(position, 1e-4, 50.0)
-    solver = MPMSolver(dx=0.1, formulation=formulation, transfer="torch", **options)
-    velocity = torch.randn(*batch, 20, 3, dtype=torch.float64, generator=generator)
+    solver = MPMSolver(0.1, formulation, transfer="torch", **options)
+    velocity = randn(*batch, 20, 3, generator=generator)
     normal = unit(*batch, 20, 3, generator=generator)
     wind = WindForce(AeroForce(), WindField([4.0, 0.0, 1.0]), normal, torch.full(position.shape[:-1], 0.01))
     return solver, solver.init_state(points, velocity), wind
@@ -55,7 +54,7 @@ def _push(state):
     return 0.2 * torch.ones_like(state.position)
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 @pytest.mark.parametrize("batch", [(), (2,)])
 @torch.no_grad()
 def test_forces_add_up(formulation, batch):
@@ -75,11 +74,11 @@ def test_forces_add_up(formulation, batch):
     for _ in range(4):
         stepped = solver.step(stepped, DT, forces)
     for other in (several, watched, stepped):
-        assert_close(other.position, state.position, rtol=0, atol=1e-12)
+        near(other.position, state.position, 1e-12)
         assert_close(other.work, state.work)
     for k in range(len(forces)):  # each of them has an effect
         fewer = solver.rollout(start, DT, 4, forces[:k] + forces[k + 1 :])
-        assert float((fewer.velocity - state.velocity).abs().max()) > 1e-5
+        assert peak(fewer.velocity - state.velocity) > 1e-5
 
 
 @torch.no_grad()
@@ -123,11 +122,11 @@ def test_what_is_no_force_is_named():
         solver.step(start, DT, torch.zeros(20, 3))
     with pytest.raises(TypeError, match="got float"):
         solver.rollout(start, DT, 1, [wind, 3.0])
-    with pytest.raises(ValueError, match=r"`force of FunctionForce` of shape \(20, 3\), but got \(3,\)"):
+    with value_error(r"`force of FunctionForce` of shape \(20, 3\), but got \(3,\)"):
         solver.rollout(start, DT, 1, lambda state: state.position[0])
     spring = Spring()
     spring.forward = lambda state: (state.position, torch.ones(3))
-    with pytest.raises(ValueError, match=r"`resistance of Spring` of shape \(20,\)"):
+    with value_error(r"`resistance of Spring` of shape \(20,\)"):
         solver.rollout(start, DT, 1, spring)
     with pytest.raises(TypeError, match=r"`force of FunctionForce` to be a torch\.Tensor, but got NoneType"):
         solver.rollout(start, DT, 1, lambda state: None)
@@ -164,14 +163,12 @@ class Everywhere(SpatialWind):
         return torch.tensor([4.0, 0.0, 1.0], dtype=position.dtype)
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 @torch.no_grad()
 def test_a_wind_may_depend_on_the_place(formulation):
     solver, start, wind = _setting(formulation)
     same = WindForce(wind.aero, Everywhere(), wind.normal, wind.area)
-    assert_close(
-        solver.rollout(start, DT, 3, same).velocity, solver.rollout(start, DT, 3, wind).velocity, rtol=0, atol=1e-13
-    )
+    near(solver.rollout(start, DT, 3, same).velocity, solver.rollout(start, DT, 3, wind).velocity, 1e-13)
     shear = WindForce(wind.aero, Shear(), wind.normal, wind.area)
     assert shear.device_function() is None
     assert shear.recordable
@@ -181,8 +178,8 @@ def test_a_wind_may_depend_on_the_place(formulation):
         force, _drag = wind.force(state, Shear()(state.time, state.position))
         state = solver.step(state, DT, force=force)
     end = solver.rollout(start, DT, 3, shear)
-    assert_close(end.velocity, state.velocity, rtol=0, atol=1e-13)
-    assert float((end.velocity - solver.rollout(start, DT, 3, wind).velocity).abs().max()) > 1e-4
+    near(end.velocity, state.velocity, 1e-13)
+    assert peak(end.velocity - solver.rollout(start, DT, 3, wind).velocity) > 1e-4
 
 
 @torch.no_grad()
@@ -192,7 +189,7 @@ def test_scenes_of_a_batch_may_mix_winds():
     air = mixed.air(start.time, start.position)
     assert_close(air[0], Shear()(start.time, start.position[0]))
     assert air[1].unique(dim=0).tolist() == [[1.0, 2.0, 3.0]]
-    assert bool(torch.isfinite(solver.rollout(start, DT, 2, mixed).position).all())
+    assert torch.isfinite(solver.rollout(start, DT, 2, mixed).position).all()
 
 
 @torch.no_grad()
@@ -229,15 +226,15 @@ ALONG = AeroForce(C_D=0.0, C_F=1.2, C_L=0.0, drag_step="semi_implicit")  # a she
 
 def _sheet(areal, e=1e4):
     """A sheet in the x-z plane, areal density in kg/m²."""
-    x = (torch.arange(8, dtype=torch.float64) + 0.5) * 0.05
+    x = (torch.arange(8).double() + 0.5) * 0.05
     gx, gz = (g.reshape(-1) for g in torch.meshgrid(x, x, indexing="ij"))
     position = torch.stack([gx, torch.full_like(gx, 0.02), gz], dim=-1)
     return solid(position, 0.05**2 * 0.01, areal / 0.01, e, 0.0)
 
 
 def _run(solver, state, wind, dt, steps, aero=AERO):
-    wind = torch.tensor(wind, dtype=torch.float64)
-    normal = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64).expand_as(state.position)
+    wind = double(wind)
+    normal = double([0.0, 1.0, 0.0]).expand_as(state.position)
     area = torch.full_like(solver.points.mass, 0.05**2)
     fastest = 0.0
     for k in range(steps):
@@ -245,46 +242,46 @@ def _run(solver, state, wind, dt, steps, aero=AERO):
         drag = aero.resistance(wind, state.velocity, area)
         state = solver.fit_grid(state, min(20, steps) * dt) if k % 20 == 0 else state
         state = solver.step(state, dt, force=force, drag=drag)
-        fastest = max(fastest, float(state.velocity.norm(dim=-1).max()))
+        fastest = max(fastest, float(longest(state.velocity)))
     return state, fastest
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 @pytest.mark.parametrize("dt", [1e-4, 1e-2, 0.1])
 def test_one_step_is_the_implicit_one(formulation, dt):
     """v+ = (v + k u) / (1 + k), k = dt rho A C v_r / 2m, for a free sheet in a wind too strong for explicit steps."""
     points = _sheet(0.02, e=1.0)  # soft, or the long substeps would be refused; a free sheet does not deform
-    solver = MPMSolver(dx=0.1, formulation=formulation, gravity=(0, 0, 0))
-    velocity = torch.tensor([0.0, -10.0, 0.0], dtype=torch.float64).expand_as(points.position)
+    solver = MPMSolver(0.1, formulation, gravity=ZERO)
+    velocity = double([0.0, -10.0, 0.0]).expand_as(points.position)
     state, _ = _run(solver, solver.init_state(points, velocity), [0.0, 30.0, 0.0], dt, 1)
     k = dt * 1.225 * 1.2 * 40.0 / (2 * 0.02)
     expected = (-10.0 + k * 30.0) / (1 + k)
     torch.testing.assert_close(state.velocity[:, 1], torch.full_like(points.mass, expected))
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_a_free_sheet_never_overtakes_the_wind(formulation):
     """A jump from calm to 100 m/s, with a substep that shrinks at the same moment."""
     points = _sheet(0.02)
-    solver = MPMSolver(dx=0.1, formulation=formulation, gravity=(0, 0, 0))
+    solver = MPMSolver(0.1, formulation, gravity=ZERO)
     state, _ = _run(solver, solver.init_state(points), [0.0, 0.0, 0.0], 4e-4, 3)
     state, fastest = _run(solver, state, [0.0, 100.0, 0.0], 1e-4, 60)
     assert fastest <= 100.0 * (1 + 1e-9)
-    assert float(state.velocity[:, 1].mean()) > 90.0
+    assert state.velocity[:, 1].mean() > 90.0
 
 
 @pytest.mark.slow(gate=["total"])
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_what_hangs_still_feels_all_of_its_weight_and_wind(formulation):
     """In equilibrium nothing moves, so the drag equals the explicit one for any substep: the same sag, with weight."""
     places = []
     for dt in (2e-4, 6e-4):
         points = _sheet(0.02, e=3e4)
-        pin = PinnedRegion(Box([None, None, 0.35], [None, None, None]))
-        solver = MPMSolver(dx=0.1, formulation=formulation, damping=30.0, boundaries=[pin])
+        pin = PinnedRegion(beyond(z=0.35))
+        solver = MPMSolver(0.1, formulation, damping=30.0, boundaries=[pin])
         state, _ = _run(solver, solver.init_state(points), [0.0, 0.0, -15.0], dt, round(0.24 / dt), ALONG)
-        assert float(state.velocity.abs().max()) < 1e-3
+        assert peak(state.velocity) < 1e-3
         places.append(state.position - points.position)
-    sag = float(places[0].abs().max())
+    sag = float(peak(places[0]))
     assert sag > 2e-4
-    torch.testing.assert_close(places[1], places[0], rtol=0, atol=0.01 * sag)
+    near(places[1], places[0], 0.01 * sag)

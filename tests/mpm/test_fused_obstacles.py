@@ -3,7 +3,7 @@
 import pytest
 import torch
 from catalogue import OBSTACLES
-from torch.testing import assert_close
+from shared import double, near, seeded
 
 from gaussian_swaying import SimFrame
 from gaussian_swaying.geometry.keyed_path import KeyedPath
@@ -43,17 +43,17 @@ def _ask_kernel(obstacle, place, time, device):
 @pytest.mark.parametrize("name", OBSTACLES)
 def test_distance_normal_and_velocity(kernel_device, name):
     """Still and in motion; before, within and after its time, and beyond its last key."""
-    frame = SimFrame(torch.tensor([0.02, 0.0, 0.01], dtype=torch.float64), rotation_from_z([0, -1, 0]).T, 1.2)
-    place = (0.9 * torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) - 0.45).to(kernel_device)
+    frame = SimFrame(double([0.02, 0.0, 0.01]), rotation_from_z([0, -1, 0]).T, 1.2)
+    place = (0.9 * torch.rand(40, 3, generator=seeded(0)) - 0.45).to(kernel_device)
     for more in [{}] if name == "still" else [{}, {"path": _path()}]:
         obstacle = OBSTACLES[name](gap=0.01, start=DT, end=39 * DT, **more).in_frame(frame)
         for moment in (0.0, 7.3 * DT, 40 * DT):
             time = torch.tensor(moment, dtype=torch.float64, device=kernel_device)
             gap, facing, drive, valid, within = _ask_kernel(obstacle, place, time, kernel_device)
             distance, normal, own = obstacle.touch(place.double(), time, DT)
-            assert_close(gap.double(), distance - 0.01, rtol=0, atol=1e-6)
-            assert_close(facing.double(), normal, rtol=0, atol=2e-4)
-            assert_close(drive.double(), own, rtol=0, atol=2e-5)
-            assert bool((valid == float(obstacle.active(time))).all())
+            near(gap.double(), distance - 0.01, 1e-6)
+            near(facing.double(), normal, 2e-4)
+            near(drive.double(), own, 2e-5)
+            assert (valid == float(obstacle.active(time))).all()
             ahead = distance - DT * (own * normal).sum(-1)  # the places are at rest
             assert within == int(bool(obstacle.active(time)) and float(torch.minimum(distance, ahead).min()) < 0.02)

@@ -2,10 +2,10 @@
 
 import pytest
 import torch
-from shared import solid
+from shared import EYE, ZERO, beyond, double, peak, rand, randn, seeded, solid
 from torch.testing import assert_close
 
-from gaussian_swaying import Box, MPMSolver, PinnedRegion, aero_force
+from gaussian_swaying import MPMSolver, PinnedRegion, aero_force
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.mpm.laws.elastic import FixedCorotated, NeoHookean
 from gaussian_swaying.mpm.transfer import bspline_stencil, scatter
@@ -20,11 +20,11 @@ LAWS = {"fixed_corotated": FixedCorotated, "neo_hookean": NeoHookean}
 
 def _rest():
     """A slanting patch of particles, none of them near a plane of half cells, to be held at its upper edge."""
-    generator = torch.Generator().manual_seed(4)
+    generator = seeded(4)
     x, z = torch.meshgrid(torch.arange(3) * 0.09 + 0.03, torch.arange(5) * 0.09 + 0.02, indexing="ij")
     position = torch.stack([x, 0.11 + 0.3 * x, z], dim=-1).reshape(-1, 3).double()
-    position = position + 0.02 * torch.rand(COUNT, 3, generator=generator, dtype=torch.float64)
-    return position, 0.5 * torch.randn(COUNT, 3, generator=generator, dtype=torch.float64)
+    position = position + 0.02 * rand(COUNT, 3, generator=generator)
+    return position, 0.5 * randn(COUNT, 3, generator=generator)
 
 
 REST, VELOCITY = _rest()
@@ -35,7 +35,7 @@ INPUTS = {  # the scale of each input, so that a derivative gives the effect of 
     "youngs_modulus": (4e3, 4e3),
     "poisson_ratio": (0.3, 0.3),
     "density": (40.0, 40.0),
-    "wind": (torch.tensor([2.0, 5.0, 1.0], dtype=torch.float64), 5.0),
+    "wind": (double([2.0, 5.0, 1.0]), 5.0),
     "C_D": (0.6, 0.6),
     "C_F": (0.4, 0.4),
     "C_L": (0.2, 0.2),
@@ -48,7 +48,7 @@ def _leaf(name):
 
 
 def _patches():
-    normal = torch.tensor([-0.3, 1.0, 0.1], dtype=torch.float64).expand(COUNT, 3)
+    normal = double([-0.3, 1.0, 0.1]).expand(COUNT, 3)
     return normal / normal.norm(dim=-1, keepdim=True), torch.full((COUNT,), 0.09**2, dtype=torch.float64)
 
 
@@ -63,7 +63,7 @@ def _start(values, law, **settings):
         law=law,
         law_index=None if isinstance(law, FixedCorotated | NeoHookean) else torch.arange(COUNT) % 2,
     )
-    solver = MPMSolver(dx=DX, boundaries=[PinnedRegion(Box([None, None, 0.35], [None, None, None]))], **settings)
+    solver = MPMSolver(DX, boundaries=[PinnedRegion(beyond(z=0.35))], **settings)
     state = solver.init_state(points, values["velocity"])
     rest_normal, rest_area = (value.to(values["position"].dtype) for value in _patches())
 
@@ -85,8 +85,8 @@ def _values(name=None, leaf=None):
 
 def _check(name, law, **settings):
     """Five substeps against central differences, and the gradient must not vanish."""
-    generator = torch.Generator().manual_seed(5)
-    weights = torch.randn(4, 12 * COUNT, generator=generator, dtype=torch.float64)
+    generator = seeded(5)
+    weights = randn(4, 12 * COUNT, generator=generator)
 
     def run(leaf):
         solver, state, force = _start(_values(name, leaf), law, **settings)
@@ -98,11 +98,11 @@ def _check(name, law, **settings):
     few = leaf.numel() <= 3
     checked = (lambda leaf: weights @ run(leaf)) if few else run
     assert torch.autograd.gradcheck(checked, leaf, eps=1e-6, atol=1e-8, rtol=1e-5, fast_mode=not few)
-    gradient = torch.autograd.grad(weights @ run(leaf), leaf, torch.ones(4, dtype=torch.float64))[0]
+    gradient = torch.autograd.grad(weights @ run(leaf), leaf, torch.ones(4).double())[0]
     # the tolerance above would accept a detached path if its gradient is this small
-    assert float(gradient.abs().max()) > 1e-4, f"The gradient by {name} vanishes: {gradient}"
+    assert peak(gradient) > 1e-4, f"The gradient by {name} vanishes: {gradient}"
     if name in ("position", "velocity"):
-        assert bool((gradient.abs().amax(-1) > 1e-6)[~HELD].all())
+        assert (gradient.abs().amax(-1) > 1e-6)[~HELD].all()
 
 
 @pytest.mark.slow(gate=[f"{name}-{few}" for few in ("total-neo_hookean", "updated-fixed_corotated") for name in INPUTS])
@@ -140,9 +140,9 @@ def test_gradients_are_finite(setting, law, case):
     if light:
         stencil = bspline_stencil(values["position"].detach(), state.grid)
         mass = scatter(stencil, solver.points.mass.detach()[:, None, None])[:, 0]
-        assert 1e-32 < float(mass[mass > 0].min()) < 5e-20
+        assert 1e-32 < mass[mass > 0].min() < 5e-20
     elif not still:
-        stretch = torch.diag(torch.tensor([-0.7 if case == "inverted" else 1e-3, 1.1, 0.9], dtype=torch.float64))
+        stretch = torch.diag(double([-0.7 if case == "inverted" else 1e-3, 1.1, 0.9]))
         if setting == "total":
             nodes = state.grid.node_positions(REST)
             moved = nodes @ stretch - nodes + state.node_displacement
@@ -155,12 +155,12 @@ def test_gradients_are_finite(setting, law, case):
     state = solver.rollout(state, 1e-3, STEPS, force)
     loss = state.position.square().sum() + state.F_total.square().sum()
     for name, gradient in zip(values, torch.autograd.grad(loss, list(values.values())), strict=True):
-        assert bool(torch.isfinite(gradient).all()), name
+        assert torch.isfinite(gradient).all(), name
         # the state at rest depends on place and velocity alone, as drag is quadratic
         alike = still and name not in ("position", "velocity")
-        assert float(gradient.abs().max()) < 1e-12 if alike else float(gradient.abs().max()) > 0, name
+        assert float(peak(gradient)) < 1e-12 if alike else float(peak(gradient)) > 0, name
     if still:
-        assert float((state.F_total.detach() - torch.eye(3, dtype=torch.float64)).abs().max()) < 1e-14
+        assert peak(state.F_total.detach() - EYE) < 1e-14
 
 
 # ---- long rollouts
@@ -169,9 +169,9 @@ def test_gradients_are_finite(setting, law, case):
 @pytest.mark.parametrize("checkpoint", [0, 7, 30])
 def test_checkpoints_find_what_is_used_late(checkpoint):
     """A force of two parts, of which the second acts only after the first substeps."""
-    points = solid(torch.rand(8, 3, dtype=torch.float64), 0.1, 10.0, 1e3)
+    points = solid(rand(8, 3), 0.1, 10.0, 1e3)
     first, second = (torch.zeros(3, dtype=torch.float64, requires_grad=True) for _ in range(2))
-    solver = MPMSolver(dx=0.5, gravity=(0, 0, 0))
+    solver = MPMSolver(0.5, gravity=ZERO)
     state = solver.rollout(
         solver.init_state(points),
         1e-3,

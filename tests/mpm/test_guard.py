@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from shared import solid, without_waits
+from shared import ZERO, double, in_both, near, randn, seeded, solid, value_error, without_waits
 
 from gaussian_swaying import Force, MPMSolver, _checks
 
@@ -24,12 +24,12 @@ def _block(side=3, dtype=torch.float64, device="cpu"):
 
 
 def _solver(formulation, points=None, dx=DX):
-    solver = MPMSolver(dx=dx, formulation=formulation, gravity=(0.0, 0.0, 0.0))
+    solver = MPMSolver(dx, formulation, gravity=ZERO)
     return solver, solver.init_state(_block() if points is None else points)
 
 
 def _broken(*shape, row=7):
-    value = torch.zeros(*shape, dtype=torch.float64)
+    value = torch.zeros(*shape).double()
     value[row] = math.nan
     return value
 
@@ -39,7 +39,7 @@ def _calls(solver, state):
     return (solver.step, lambda s, dt: solver.rollout(s, dt, 3), lambda s, dt: solver.watched_rollout(s, dt, 3)), state
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 @pytest.mark.parametrize(
     ("dt", "kind", "message"),
     [
@@ -59,12 +59,12 @@ def test_a_substep_that_is_none(formulation, dt, kind, message):
             call(state, dt)
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_no_stable_substep_is_refused(formulation):
     """The limit lies above the substep that is stable for any arrangement, and below it a usual body explodes."""
     for damping in (0.0, 0.01):
-        solver = MPMSolver(dx=DX, formulation=formulation, gravity=(0, 0, 0), stiffness_damping=damping)
-        state = solver.init_state(_block(6), 1e-9 * torch.randn(216, 3, dtype=torch.float64, generator=_random()))
+        solver = MPMSolver(DX, formulation, gravity=ZERO, stiffness_damping=damping)
+        state = solver.init_state(_block(6), 1e-9 * randn(216, 3, generator=_random()))
         limit = solver.bound.longest_substep
         assert solver.stable_substep() < limit
         solver.rollout(state, solver.stable_substep(), 2)
@@ -73,10 +73,10 @@ def test_no_stable_substep_is_refused(formulation):
 
 
 def _random():
-    return torch.Generator().manual_seed(0)
+    return seeded(0)
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_numbers_of_substeps(formulation):
     solver, state = _solver(formulation)
     for steps, kind, message in (
@@ -101,40 +101,40 @@ class _Broken(Force):
         return torch.where(state.time >= self.since, bad, 0 * bad.nan_to_num())
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_what_is_given_as_nan_is_named(formulation):
     solver, state = _solver(formulation)
     bad = _broken(27, 3)
-    with pytest.raises(ValueError, match="the force of step on particle 7 is NaN"):
+    with value_error("the force of step on particle 7 is NaN"):
         solver.step(state, DT, force=bad)
-    with pytest.raises(ValueError, match="the resistance of step of particle 7 is NaN"):
+    with value_error("the resistance of step of particle 7 is NaN"):
         solver.step(state, DT, force=torch.zeros_like(bad), drag=bad[:, 0])
     for call in (solver.rollout, solver.watched_rollout):
-        with pytest.raises(ValueError, match="the force of _Broken on particle 7 is NaN"):
+        with value_error("the force of _Broken on particle 7 is NaN"):
             call(state, DT, 3, _Broken(0.0))
 
     def lots(state):
         return torch.zeros_like(state.position), bad[:, 0]
 
-    with pytest.raises(ValueError, match="the resistance of lots of particle 7 is NaN"):
+    with value_error("the resistance of lots of particle 7 is NaN"):
         solver.rollout(state, DT, 3, lots)
     with pytest.raises(FloatingPointError, match=r"became NaN or infinite within the rollout: lower `dt` \(stable at"):
         solver.rollout(state, DT, 3, _Broken(1.5 * DT))
     name = "velocity" if formulation == "updated" else "node_velocity"
     given = getattr(state, name).clone()
     given[5] = math.nan
-    with pytest.raises(ValueError, match=f"the velocity of {'particle' if formulation == 'updated' else 'node'} 5 is"):
+    with value_error(f"the velocity of {'particle' if formulation == 'updated' else 'node'} 5 is"):
         solver.rollout(state.replace(**{name: given}), DT, 3)
-    with pytest.raises(ValueError, match="Expected `velocity` to be finite, but that of particle 7 is not"):
+    with value_error("Expected `velocity` to be finite, but that of particle 7 is not"):
         solver.init_state(_block(), bad)
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_tensors_of_another_kind(formulation):
     """Device, dtype and length; the force of a function takes the dtype of the state, if it is a real one."""
     solver, state = _solver(formulation)
     for name, shape in (("force", (27, 3)), ("drag", (27,))):
-        given = torch.zeros(shape, dtype=torch.float64)
+        given = torch.zeros(shape).double()
         for wrong, kind, message in (
             (given.float(), TypeError, f"Expected `{name}` in float64, as the material is, but got float32"),
             (given.to("meta"), ValueError, f"Expected `{name}` on cpu, .* but it is on meta"),
@@ -143,7 +143,7 @@ def test_tensors_of_another_kind(formulation):
         ):
             with pytest.raises(kind, match=message):
                 solver.step(state, DT, **{name: wrong})
-    given = torch.zeros(27, 3, dtype=torch.float64)
+    given = torch.zeros(27, 3).double()
     assert solver.rollout(state, DT, 1, lambda _: given.float()).position.dtype == torch.float64
     for wrong, kind, message in (
         (given.to(torch.complex128), TypeError, "Expected `force of FunctionForce` in float64, .* got complex128"),
@@ -154,18 +154,18 @@ def test_tensors_of_another_kind(formulation):
             solver.rollout(state, DT, 1, lambda _, wrong=wrong: wrong)
     with pytest.raises(TypeError, match="Expected `velocity` in float64, as the material is, but got float32"):
         solver.init_state(_block(), given.float())
-    with pytest.raises(ValueError, match="Expected `velocity` on cpu"):
+    with value_error("Expected `velocity` on cpu"):
         solver.init_state(_block(), given.to("meta"))
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_no_points(formulation):
     empty = solid(torch.zeros(0, 3), 1.0, 1.0, 1.0)
-    with pytest.raises(ValueError, match="Expected `points` with at least one point, but got none"):
-        MPMSolver(dx=DX, formulation=formulation).init_state(empty)
+    with value_error("Expected `points` with at least one point, but got none"):
+        MPMSolver(DX, formulation).init_state(empty)
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_the_state_of_another_solver(formulation):
     solver, state = _solver(formulation)
     other = FORMULATIONS[formulation == "total"]
@@ -191,11 +191,11 @@ def test_the_state_of_another_solver(formulation):
 def test_a_plate_that_leaves_its_grid():
     """Its particles then stand still without a word, unless the grid is made for where it flies."""
     plate = _block()
-    speed = torch.tensor([12.0, 0.0, 0.0], dtype=torch.float64).expand(27, 3)
-    solver = MPMSolver(dx=DX, formulation="updated", gravity=(0.0, 0.0, 0.0))
+    speed = double([12.0, 0.0, 0.0]).expand(27, 3)
+    solver = MPMSolver(DX, "updated", gravity=ZERO)
     state = solver.init_state(plate, speed)
     for call in (solver.rollout, solver.watched_rollout):
-        with pytest.raises(ValueError, match=r"left the grid .* call `solver.fit_grid\(state, 0.048\)` before"):
+        with value_error(r"left the grid .* call `solver.fit_grid\(state, 0.048\)` before"):
             call(state, 4 * DT, 12)
 
     def one_by_one():
@@ -203,22 +203,22 @@ def test_a_plate_that_leaves_its_grid():
         for _ in range(12):
             now = solver.step(now, 4 * DT)
 
-    with pytest.raises(ValueError, match=r"left the grid .* call `solver.fit_grid"):
+    with value_error(r"left the grid .* call `solver.fit_grid"):
         one_by_one()
     end = solver.rollout(solver.fit_grid(state, 0.048), 4 * DT, 12)
-    torch.testing.assert_close(end.velocity, speed, rtol=0, atol=12 * 12 * 27 * 2**-52)  # a sum of 27 in each substep
+    near(end.velocity, speed, 12 * 12 * 27 * 2**-52)  # a sum of 27 in each substep
     marked = solver.rollout(state, 4 * DT, 12, check=False)
-    assert bool(marked.lost.any())
-    with pytest.raises(ValueError, match="left the grid"):  # of the rollout before
+    assert marked.lost.any()
+    with value_error("left the grid"):  # of the rollout before
         solver.rollout(solver.fit_grid(marked, DT), DT, 1)
 
 
 def test_a_plate_that_a_force_drives_out_of_a_fitted_grid():
     """The grid knows speeds and gravity alone; a margin makes room for the rest."""
     solver, state = _solver("updated")
-    push = torch.zeros(27, 3, dtype=torch.float64)
+    push = torch.zeros(27, 3).double()
     push[:, 0] = 2e3 * solver.points.mass
-    with pytest.raises(ValueError, match="with a `margin` of some cells"):
+    with value_error("with a `margin` of some cells"):
         solver.rollout(solver.fit_grid(state, 0.02), DT, 20, lambda _: push)
     end = solver.rollout(solver.fit_grid(state, 0.02, margin=8), DT, 20, lambda _: push)
     assert float(end.velocity[:, 0].min()) == pytest.approx(2e3 * 0.02)
@@ -240,22 +240,22 @@ def test_a_simulation_reads_what_is_wrong_with_its_measurements(monkeypatch):
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_on_a_gpu_a_rollout_is_checked_and_a_step_does_not_wait(formulation):
     points = _block(dtype=torch.float32, device="cuda")
-    solver = MPMSolver(dx=DX, formulation=formulation)
+    solver = MPMSolver(DX, formulation)
     state = solver.step(solver.init_state(points), DT)
     bad = _broken(27, 3).float().cuda()
     torch.cuda.synchronize()
     with without_waits():
         state = solver.step(state, DT, force=bad)
-    with pytest.raises(ValueError, match="is NaN or infinite"):
+    with value_error("is NaN or infinite"):
         solver.rollout(state, DT, 2)
 
 
 @pytest.mark.parametrize("value", [0, 1.0, True, "2", None])
 def test_a_whole_number_that_is_none_or_too_small(value):
-    with pytest.raises(ValueError, match="`downscale` to be a whole number of at least 1, but got"):
+    with value_error("`downscale` to be a whole number of at least 1, but got"):
         _checks.check_whole("downscale", value, 1)
 
 

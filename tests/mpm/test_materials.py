@@ -2,7 +2,7 @@
 
 import math
 
-import pytest
+from shared import value_error
 
 from gaussian_swaying.mpm.materials import MATERIALS, known_material, name_of
 
@@ -60,5 +60,5 @@ def test_damping_is_that_of_a_sway_at_1_hz():
 
 
 def test_an_unknown_name_lists_the_names():
-    with pytest.raises(ValueError, match=f"Expected `material` to be one of {', '.join(NAMES)}, but got 'coton'"):
+    with value_error(f"Expected `material` to be one of {', '.join(NAMES)}, but got 'coton'"):
         known_material("coton")

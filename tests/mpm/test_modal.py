@@ -5,16 +5,15 @@ import math
 import numpy as np
 import pytest
 import torch
-from shared import solid
-from torch.testing import assert_close
+from shared import ZERO, alike, beyond, near, peak, rand, randn, seeded, solid, up_to, value_error
 
-from gaussian_swaying import Box, MPMSolver, PinnedRegion
+from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion
 from gaussian_swaying.mpm import modal
 from gaussian_swaying.mpm.laws.elastic import FixedCorotated, NeoHookean, StVKHencky
 from gaussian_swaying.mpm.modal import LOOSE, Structure, analysis_of
 from gaussian_swaying.mpm.pins import RigidRegion
 
-FOOT = Box([None] * 3, [None, None, 0.1])
+FOOT = up_to(z=0.1)
 
 
 @pytest.fixture(autouse=True)
@@ -25,7 +24,7 @@ def cache(tmp_path, monkeypatch):
 
 def lattice(low, high, spacing):
     axes = [
-        torch.arange(round((b - a) / spacing), dtype=torch.float64) * spacing + a + 0.5 * spacing
+        torch.arange(round((b - a) / spacing)).double() * spacing + a + 0.5 * spacing
         for a, b in zip(low, high, strict=True)
     ]
     return torch.cartesian_prod(*axes)
@@ -41,7 +40,7 @@ def post(spacing=0.05, E=2e5, density=100.0, law=None, nu=0.3, extra=(), width=0
 
 def bound(points, dx=0.1, boundaries=None, formulation="total"):
     boundaries = [PinnedRegion(FOOT)] if boundaries is None else boundaries
-    solver = MPMSolver(dx, formulation, gravity=(0, 0, 0), boundaries=boundaries, transfer="torch")
+    solver = MPMSolver(dx, formulation, gravity=ZERO, boundaries=boundaries, transfer="torch")
     solver.init_state(points)
     return solver
 
@@ -49,8 +48,8 @@ def bound(points, dx=0.1, boundaries=None, formulation="total"):
 @pytest.mark.parametrize("law", [FixedCorotated, NeoHookean, StVKHencky])
 def test_the_stiffness_is_the_second_derivative_of_the_energy(law):
     """By central differences: the error is that of the fourth derivative, 1e-8 at a strain of 1e-4, and rounding."""
-    generator = torch.Generator().manual_seed(0)
-    points = post(law=law(), stiff=(slice(None), 1 + torch.rand(320, generator=generator, dtype=torch.float64)))
+    generator = seeded(0)
+    points = post(law=law(), stiff=(slice(None), 1 + rand(320, generator=generator)))
     solver = bound(points)
     rest = solver.init_state(points)
     total = solver.bound
@@ -65,7 +64,7 @@ def test_the_stiffness_is_the_second_derivative_of_the_energy(law):
 
     step = 1e-5  # over dx = 0.1
     for _ in range(4):
-        u = torch.randn(total.grid.node_count, 3, generator=generator, dtype=torch.float64)
+        u = randn(total.grid.node_count, 3, generator=generator)
         second = (energy(step * u) + energy(-step * u) - 2 * energy(0 * u)) / step**2
         flat = u.flatten().numpy()
         assert flat @ (K @ flat) == pytest.approx(second, rel=1e-5)
@@ -105,8 +104,8 @@ def test_the_first_frequency_is_that_of_a_free_vibration():
     modes = bound(points, formulation="modes").bound
     own = int(torch.argmin((modes.square.sqrt() - modes.first).abs()))
     shape = modes.shape[:, own].reshape(-1, 3)
-    u = torch.zeros(modes.grid.node_count, 3, dtype=torch.float64).index_copy(0, modes.node, shape)
-    u = 1e-4 * u / u.abs().max()
+    u = torch.zeros(modes.grid.node_count, 3).double().index_copy(0, modes.node, shape)
+    u = 1e-4 * u / peak(u)
     solver = bound(points)
     state = solver.init_state(points)
     state = solver.bound.read_particles(state, u, torch.zeros_like(u))
@@ -129,14 +128,14 @@ def test_a_factor_of_stiffness_or_mass_is_exact_and_needs_no_analysis(cache, mon
     assert len(list(cache.glob("modes_*.npz"))) == 1
     monkeypatch.setattr(Structure, "analyse", lambda *given: pytest.fail("it is in the cache"))
     stiffer = bound(post(E=8e5), boundaries=pin, formulation="modes").bound
-    assert_close(stiffer.square, 4 * first.square, rtol=1e-14, atol=0)
+    alike(stiffer.square, 4 * first.square, 1e-14)
     assert stiffer.first == pytest.approx(2 * first.first, rel=1e-14)
-    assert_close(stiffer.shape, first.shape, rtol=0, atol=0)
+    near(stiffer.shape, first.shape, 0)
     for density in (100.001, 237.3):  # rounding is no other body
         bound(post(density=density), boundaries=pin, formulation="modes")
     heavier = bound(post(density=400.0), boundaries=pin, formulation="modes").bound
-    assert_close(heavier.square, first.square / 4, rtol=1e-14, atol=0)
-    assert_close(heavier.shape, first.shape / 2, rtol=1e-14, atol=0)
+    alike(heavier.square, first.square / 4, 1e-14)
+    alike(heavier.shape, first.shape / 2, 1e-14)
 
 
 def test_what_is_in_the_cache_is_the_same_to_the_bit_and_a_damaged_file_is_ignored(cache):
@@ -218,7 +217,7 @@ def test_a_bit_that_hangs_by_a_thread_is_left_out(monkeypatch):
 
 def test_a_rigid_part_has_six_degrees_of_freedom():
     """And moves without strain in every mode."""
-    head = RigidRegion(Box([None, None, 0.6], [None] * 3))
+    head = RigidRegion(beyond(z=0.6))
     points = post()
     soft = Structure(bound(points).bound)
     structure = Structure(bound(points, boundaries=[PinnedRegion(FOOT), head]).bound)
@@ -240,37 +239,23 @@ def test_a_rigid_part_has_six_degrees_of_freedom():
         assert abs(rows @ fit - moved.ravel()).max() < 1e-9 * abs(moved).max()
 
 
-def test_what_nothing_holds_is_refused():
-    with pytest.raises(ValueError, match="nothing holds it: pin a part of it, or set it to total"):
-        bound(post(), boundaries=[], formulation="modes")
-
-
-def test_a_body_that_hangs_loose_is_refused():
-    """Two points across one cell leave shapes of its nodes without any strain at a point."""
-    with pytest.raises(ValueError, match="most of this one hangs loose: hold more of it, give it more points"):
-        bound(post(width=0.1), formulation="modes")
-
-
-def test_a_body_that_is_held_as_a_whole_is_refused():
-    whole = [PinnedRegion(Box([None] * 3, [None] * 3))]
-    with pytest.raises(ValueError, match=r"`solver\.formulation: modes`"):
-        Structure(bound(post(), boundaries=whole).bound).analyse(10)
-
-
-def test_too_many_unknowns_are_refused(monkeypatch):
-    monkeypatch.setattr(modal, "MOST_UNKNOWNS", 100)
-    with pytest.raises(ValueError, match=r"unknowns \(at most 100\): raise `solver.dx`, or set it to total"):
-        bound(post(), formulation="modes")
+@pytest.mark.parametrize(
+    ("width", "most", "region", "words"),
+    [
+        # two points across one cell leave shapes of its nodes without any strain at a point
+        (0.1, 10_000, FOOT, "most of this one hangs loose: hold more of it, give it more points"),
+        (0.2, 10_000, Box([None] * 3, [None] * 3), r"`solver\.formulation: modes`"),
+        (0.2, 100, FOOT, r"unknowns \(at most 100\): raise `solver.dx`, or set it to total"),
+    ],
+)
+def test_what_has_no_modes_is_refused(width, most, region, words, monkeypatch):
+    monkeypatch.setattr(modal, "MOST_UNKNOWNS", most)
+    with value_error(words):
+        Structure(bound(post(width=width), boundaries=[PinnedRegion(region)]).bound).analyse(10)
 
 
 def test_a_batch_analyses_each_of_its_scenes():
-    one, other = post(), post(E=1e5, stiff=(slice(40), 5))
-    both = solid(
-        torch.stack([one.position, other.position]),
-        0.05**3,
-        100.0,
-        torch.stack([one.youngs_modulus, other.youngs_modulus]),
-    )
-    found = bound(both, formulation="modes").bound
-    alone = [bound(points, formulation="modes").bound for points in (one, other)]
-    assert_close(found.firsts, torch.stack([b.firsts for b in alone]), rtol=1e-12, atol=0)
+    scenes = post(), post(E=1e5, stiff=(slice(40), 5))
+    found = bound(MaterialPoints.stack(scenes), formulation="modes").bound
+    alone = [bound(points, formulation="modes").bound.firsts for points in scenes]
+    alike(found.firsts, torch.stack(alone), 1e-12)

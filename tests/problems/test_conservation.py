@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 from bench.problems.settings import Settings, block
-from shared import solid
+from shared import EYE, double, near, rand, solid
 from torch.testing import assert_close
 
 VARIANTS = [Settings(), Settings("updated")]
@@ -14,15 +14,15 @@ DX, RATE = 0.1, ((0.5, -0.8, -0.5), (0.8, 0.5, -0.3), (0.5, 0.3, 0.5))
 
 
 def _scattered(count=200):
-    position = 0.4 * torch.rand(count, 3, dtype=torch.float64)
+    position = 0.4 * rand(count, 3)
     return solid(position, 0.4**3 / count)
 
 
 def _affine(settings, points, rate, velocity=(0.2, 0.2, 0.2)):
     """Solver and state of a body that spins and grows: v = V + A (X - centre), exactly so at the nodes too."""
     solver = settings.solver(DX)
-    a = torch.tensor(rate, dtype=torch.float64)
-    centre, drift = points.position.mean(0), torch.tensor(velocity, dtype=torch.float64)
+    a = double(rate)
+    centre, drift = points.position.mean(0), double(velocity)
     state = solver.init_state(points, (points.position - centre) @ a.T + drift)
     if settings.formulation == "total":
         return solver, state.replace(node_velocity=(state.grid.node_positions(centre) - centre) @ a.T + drift)
@@ -37,7 +37,7 @@ def _drift(solver, state, steps, tamper=lambda state: state):
             state = tamper(solver.step(state, 1e-3))
             largest = max(largest, float(solver.energies(state)["elastic"]))
     after = solver.momenta(state)
-    assert largest > 1e-5 * float(solver.points.mass.sum())  # J/kg: it did deform
+    assert largest > 1e-5 * solver.points.mass.sum()  # J/kg: it did deform
     return {name: float((after[name] - before[name]).norm() / before[name].norm()) for name in before}
 
 
@@ -62,19 +62,19 @@ def test_affine_velocity_is_reproduced(settings):
     points = _scattered()
     solver, state = _affine(settings, points, RATE)
     end = solver.step(state, 1e-3)
-    rate = torch.tensor(RATE, dtype=torch.float64)
+    rate = double(RATE)
     expected = (points.position - points.position.mean(0)) @ rate.T + 0.2
-    assert_close(end.velocity, expected, rtol=0, atol=1e-13)
-    assert_close(end.affine, rate.expand_as(end.affine), rtol=0, atol=1e-12)
-    assert_close(end.position, points.position + 1e-3 * expected, rtol=0, atol=1e-12)
-    F = torch.eye(3, dtype=torch.float64) + 1e-3 * rate
-    assert_close(end.F_elastic, F.expand_as(end.F_elastic), rtol=0, atol=1e-12)
+    near(end.velocity, expected, 1e-13)
+    near(end.affine, rate.expand_as(end.affine), 1e-12)
+    near(end.position, points.position + 1e-3 * expected, 1e-12)
+    F = EYE + 1e-3 * rate
+    near(end.F_elastic, F.expand_as(end.F_elastic), 1e-12)
 
 
 def _elsewhere(settings, shift, rate, steps):
     """Displacements of a body moved by a number of cells, and how far its size changed."""
     points = block(DX, (0, 0, 0), (3, 3, 3), settings, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3)
-    moved = dataclasses.replace(points, position=points.position + DX * torch.tensor(shift, dtype=torch.float64))
+    moved = dataclasses.replace(points, position=points.position + DX * double(shift))
     solver, state = _affine(settings, moved, rate)
     return solver.rollout(state, 1e-3, steps).position - moved.position
 
@@ -82,7 +82,7 @@ def _elsewhere(settings, shift, rate, steps):
 @EACH
 def test_motion_does_not_depend_on_the_place_by_whole_cells(settings):
     a, b = (_elsewhere(settings, shift, RATE, 100) for shift in ((0.0, 0.0, 0.0), (7.0, -3.0, 12.0)))
-    assert_close(a, b, rtol=0, atol=1e-12)
+    near(a, b, 1e-12)
 
 
 @EACH

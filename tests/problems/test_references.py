@@ -15,6 +15,7 @@ from bench.problems.settings import fit_sinusoid
 from bench.problems.trees import WOOD_DENSITY, WOOD_E, Piece, frame_modes
 from bench.problems.vortex import body_force, placement
 from bench.problems.wrinkles import wavelength
+from shared import double, near
 from torch.func import jacrev, vmap
 
 from gaussian_swaying.mpm.laws.elastic import fixed_corotated_pk1
@@ -69,8 +70,8 @@ def test_what_is_read_from_series_and_lines():
 
 def test_the_body_force_of_the_vortex_is_the_residual_of_its_momentum_balance():
     """Acceleration and divergence of the stress by automatic differentiation of the placement."""
-    rest = torch.tensor([[0.9, 0.2, 0.1], [-0.3, 1.0, 0.0], [0.1, -1.1, 0.2]], dtype=torch.float64)
-    mu, lam, time = (torch.tensor(value, dtype=torch.float64) for value in (380.0, 570.0, 0.5))
+    rest = double([[0.9, 0.2, 0.1], [-0.3, 1.0, 0.0], [0.1, -1.1, 0.2]])
+    mu, lam, time = (double(value) for value in (380.0, 570.0, 0.5))
     density = 900.0
 
     def stress(x):
@@ -79,4 +80,4 @@ def test_the_body_force_of_the_vortex_is_the_residual_of_its_momentum_balance():
     divergence = torch.stack([torch.einsum("iJJ->i", jacrev(stress)(x)) for x in rest])
     acceleration = vmap(lambda x: jacrev(jacrev(lambda s: placement(x, s, 1.0)))(time))(rest)
     expected = acceleration - divergence / density
-    torch.testing.assert_close(body_force(rest, time, 1.0, 380.0, density), expected, rtol=0, atol=1e-11)
+    near(body_force(rest, time, 1.0, 380.0, density), expected, 1e-11)

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from bench.problems.surfaces import sphere_of_gaussians
-from shared import solid
+from shared import ZERO, double, in_both, solid
 
 from gaussian_swaying import AeroForce, MPMSolver
 from gaussian_swaying.geometry.patches import deform_patch
@@ -15,13 +15,13 @@ SIDE, SPACING, THICKNESS, DENSITY, AIR, C = 0.4, 0.05, 0.01, 20.0, 1.225, 1.2
 
 def _fly(formulation, law, wind, seconds):
     """Mean velocity of a stiff square plate in the x-z plane after some time in wind along y, its normal."""
-    axis = (torch.arange(round(SIDE / SPACING), dtype=torch.float64) + 0.5) * SPACING
+    axis = (torch.arange(round(SIDE / SPACING)).double() + 0.5) * SPACING
     points = solid(torch.cartesian_prod(axis, torch.zeros(1).double(), axis), SPACING**2 * THICKNESS, DENSITY)
-    solver = MPMSolver(dx=0.1, formulation=formulation, gravity=(0, 0, 0))
+    solver = MPMSolver(0.1, formulation, gravity=ZERO)
     aero = AeroForce(C_D=C, C_F=0.0, C_L=0.0, air_density=AIR, law=law)
-    normal = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64).expand(points.count, 3)
+    normal = double([0.0, 1.0, 0.0]).expand(points.count, 3)
     area = torch.full((points.count,), SPACING**2, dtype=torch.float64)
-    flow = torch.tensor([0.0, wind, 0.0], dtype=torch.float64)
+    flow = double([0.0, wind, 0.0])
     state = solver.init_state(points)
     for _ in range(round(seconds / 0.04)):
         steps = solver.substeps(state, 0.04)
@@ -33,7 +33,7 @@ def _fly(formulation, law, wind, seconds):
 
 
 @pytest.mark.slow(gate=["paper-total", "projected-updated", "linear-total", "linear-updated"])
-@pytest.mark.parametrize("formulation", ["total", "updated"])
+@in_both
 @pytest.mark.parametrize("law", ["paper", "projected", "linear"])
 def test_a_free_plate_approaches_the_speed_of_the_wind(formulation, law):
     """v = U - U / (1 + U t / L), or U (1 - exp(-U t / L)) in linear drag, with L = 2 m / (rho A C): within 1 %."""
@@ -66,7 +66,7 @@ def test_force_on_a_sphere_does_not_depend_on_the_gaussians_that_carry_it(option
     for count, overlap in ((500, 0.5), (2000, 0.3), (2000, 1.0), (6000, 0.6)):
         model = sphere_of_gaussians(count, overlap, radius)
         force = aero(flow, torch.zeros(count, 3), model.normals(), model.areas("coverage")).sum(0) / unit
-        assert float((force - exact * flow / 3).norm()) < 0.03 * (exact or 2 * math.pi)
+        assert (force - exact * flow / 3).norm() < 0.03 * (exact or 2 * math.pi)
 
 
 def test_the_literal_areas_scale_the_force_on_a_sphere_by_the_overlap():

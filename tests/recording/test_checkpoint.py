@@ -9,7 +9,7 @@ import traceback
 import pytest
 import torch
 from damage import Fuse
-from shared import contents
+from shared import contents, value_error
 
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.mpm.solver import MPMSolver
@@ -35,9 +35,7 @@ def test_what_is_no_checkpoint_changes_nothing(make_simulation, tmp_path):
     for broken in (b"", b"hello", content[: len(content) // 2], pickle.dumps({"frame": 1})):
         file.write_bytes(broken)
         before = contents(folder)
-        with pytest.raises(
-            ValueError, match=r"^[^\n]*checkpoint\.pt cannot be read .* start again without --resume\.$"
-        ):
+        with value_error(r"^[^\n]*checkpoint\.pt cannot be read .* start again without --resume\.$"):
             go(3, True)
         assert contents(folder) == before
     file.write_bytes(content)
@@ -63,7 +61,7 @@ def test_a_checkpoint_executes_no_code(tmp_path, bare):
         file.write_bytes(pickle.dumps(held))
     else:
         save_whole(file, held)
-    with pytest.raises(ValueError, match="more than tensors, numbers and text") as caught:
+    with value_error("more than tensors, numbers and text") as caught:
         read_checkpoint(file)
     assert "weights_only" not in "".join(traceback.format_exception(caught.value, limit=0))
     assert not (tmp_path / "burnt").exists()
@@ -75,7 +73,7 @@ def test_a_splat_that_was_exchanged(make_cloud, tmp_path):
 
     def go(frames, resume, given=None):
         scene, camera = Scene(ply=str(file)), OrbitCamera(width=8, height=8)
-        simulation = Simulation(scene, solver=MPMSolver(dx=0.25), camera=camera, device="cpu", cloud=given)
+        simulation = Simulation(scene, solver=MPMSolver(0.25), camera=camera, device="cpu", cloud=given)
         simulation.run(folder, frames, resume=resume, progress=False, recorder=Recorder(**QUIET))
 
     write_ply(file, cloud)
@@ -83,10 +81,10 @@ def test_a_splat_that_was_exchanged(make_cloud, tmp_path):
     other = shutil.copy(file, tmp_path / "other.ply")
     cloud.means[0] += 0.01
     write_ply(file, cloud)
-    with pytest.raises(ValueError, match=r"splat .*splat.ply has changed since .* restore the old file, or start"):
+    with value_error(r"splat .*splat.ply has changed since .* restore the old file, or start"):
         go(3, True)
     shutil.copy(other, file)
-    with pytest.raises(ValueError, match=r"holds \d+ particles, but the scene has \d+: resume with the same splat"):
+    with value_error(r"holds \d+ particles, but the scene has \d+: resume with the same splat"):
         go(3, True, make_cloud(20))
     go(3, True)
 

@@ -14,7 +14,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
-from shared import advanced, without_waits
+from shared import advanced, near, peak, value_error, without_waits
 
 from gaussian_swaying.config.parser import as_filmed
 from gaussian_swaying.gaussians.harmonics import sh_to_color
@@ -109,10 +109,10 @@ def test_what_is_switched_off_is_not_written(make_simulation, tmp_path):
     recorder = Recorder(images=False, video=False, trajectory=False, checkpoint_every=0, nodes=False)
     _run(make_simulation(), tmp_path / "run", recorder=recorder)
     assert _names(tmp_path / "run") == ["config.yaml", "diagnostics.csv", "run.json", "summary.json"]
-    with pytest.raises(ValueError, match=r"`recorder.images`"):
+    with value_error(r"`recorder.images`"):
         Recorder(images=False)
     for name, value in (("checkpoint_every", -1), ("fps", 0.0)):
-        with pytest.raises(ValueError, match=name):
+        with value_error(name):
             Recorder(**{name: value})
 
 
@@ -149,7 +149,7 @@ def test_the_trajectory_holds_every_frame(make_simulation, tmp_path):
         position, F = load_trajectory(tmp_path / "run" / "trajectory.npz", frame)
         assert torch.equal(position, state.position)
         torch.testing.assert_close(F, state.F_total, rtol=1e-3, atol=1e-3)
-    with pytest.raises(ValueError, match="has no frame 3: it has 3 frames"):
+    with value_error("has no frame 3: it has 3 frames"):
         load_trajectory(tmp_path / "run" / "trajectory.npz", 3)
 
 
@@ -161,20 +161,20 @@ def test_exported_gaussians_are_the_deformed_ones(make_cloud, make_simulation, t
     for frame in simulation.frames(3):
         frame.save(tmp_path / f"{frame.index}.ply")
     rest = read_ply(tmp_path / "0.ply")
-    torch.testing.assert_close(rest.sh, cloud.sh, rtol=0, atol=1e-5)
+    near(rest.sh, cloud.sh, 1e-5)
     state, _ = advanced(simulation, 2)
     deformed = simulation.scene.deformed(state)
     found = read_ply(tmp_path / "2.ply")
-    assert float((deformed.means - cloud.means).abs().max()) > 0.01
+    assert peak(deformed.means - cloud.means) > 0.01
     torch.testing.assert_close(found.means, deformed.means)
-    torch.testing.assert_close(found.quats.norm(dim=-1), torch.ones(40), rtol=0, atol=1e-5)
+    near(found.quats.norm(dim=-1), torch.ones(40), 1e-5)
     torch.testing.assert_close(covariance(found.quats, found.scales), deformed.covariances, rtol=1e-4, atol=1e-7)
     torch.testing.assert_close(found.opacities, cloud.opacities)
     camera = simulation.painter.camera_at(2).to(dtype=torch.float32)
     seen = sh_to_color(found.sh, found.means - camera.position)
-    torch.testing.assert_close(seen, simulation.painter.colors(deformed, camera), rtol=0, atol=1e-4)
+    near(seen, simulation.painter.colors(deformed, camera), 1e-4)
     unturned = sh_to_color(cloud.sh, found.means - camera.position)
-    assert float((seen - unturned).abs().max()) > 0.01
+    assert peak(seen - unturned) > 0.01
     torch.testing.assert_close(found.normals, deformed.normals)
     torch.testing.assert_close(found.normals.norm(dim=-1), torch.ones(40))
 
@@ -548,15 +548,15 @@ def test_the_end_of_a_motion_becomes_its_beginning(make_simulation, tmp_path):
             share *= share * (3 - 2 * share)
             expected = torch.lerp(states[k + 3], states[max(0, k - 4)], share)[nodes]
             torch.testing.assert_close(found[k], expected, rtol=1e-3, atol=1e-6)
-    assert float((found[6] - found[0]).norm()) < 0.4 * float((states[9] - states[3])[nodes].norm())
-    with pytest.raises(ValueError, match=r"resume with the `frames` and the `recorder.loop` of the run"):
+    assert (found[6] - found[0]).norm() < 0.4 * (states[9] - states[3])[nodes].norm()
+    with value_error(r"resume with the `frames` and the `recorder.loop` of the run"):
         _run(simulation, tmp_path / "whole", 12, Recorder(loop=0.12), resume=True)
 
 
 def test_what_cannot_close(make_simulation, tmp_path):
-    with pytest.raises(ValueError, match=r"`frames` to more than 10, or shorten `recorder.loop`"):
+    with value_error(r"`frames` to more than 10, or shorten `recorder.loop`"):
         _run(make_simulation(), tmp_path / "run", 10, Recorder(loop=0.2))
-    with pytest.raises(ValueError, match=r"With `recorder.loop`, `recorder.renders` can be color, depth and normal"):
+    with value_error(r"With `recorder.loop`, `recorder.renders` can be color, depth and normal"):
         _run(make_simulation(), tmp_path / "run", 10, Recorder(loop=0.04, renders=("color", "force")))
 
 
@@ -569,7 +569,7 @@ def test_slow_motion_and_loops_of_the_command_line():
     assert (found.recorder.fps, found.recorder.loop) == (25.0, 0.5)
     assert as_filmed(plain).recorder == plain.recorder
     assert as_filmed(parser.parse_args(["--loop", "--frames=51"])).recorder.loop == 1.0
-    with pytest.raises(ValueError, match="`slow` to be positive"):
+    with value_error("`slow` to be positive"):
         as_filmed(parser.parse_args(["--slow=0"]))
 
 
@@ -581,7 +581,7 @@ def test_foreign_files_are_not_overwritten(make_simulation, tmp_path):
     file = tmp_path / "mine/frames/00000.png"
     file.parent.mkdir(parents=True)
     file.write_text("precious")
-    with pytest.raises(ValueError, match=r"mine contains frames of .* choose another with --output"):
+    with value_error(r"mine contains frames of .* choose another with --output"):
         _run(make_simulation(), tmp_path / "mine", 1)
     assert file.read_text() == "precious"
     assert _names(tmp_path / "mine") == ["frames", "frames/00000.png"]

@@ -4,7 +4,7 @@ import json
 
 import imageio.v3 as iio
 import pytest
-from shared import contents
+from shared import contents, value_error
 
 from gaussian_swaying._files import remove_temporaries, temporary_name
 from gaussian_swaying.recording.recorder import Recorder
@@ -48,7 +48,7 @@ def test_a_cut_trajectory_is_found_at_the_start(run):
     folder, resume = run
     (folder / "trajectory.npz").write_bytes((folder / "trajectory.npz").read_bytes()[:99])
     before = contents(folder)
-    with pytest.raises(ValueError, match=r"trajectory\.npz is not a \.npz file, or is incomplete"):
+    with value_error(r"trajectory\.npz is not a \.npz file, or is incomplete"):
         resume()
     assert contents(folder) == before
 

@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from shared import seeded
 
 from gaussian_swaying.rendering.brush import REACH, SOLID, seen, touched
 from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
@@ -67,7 +68,7 @@ PATHS = {
 @pytest.mark.parametrize("path", PATHS.values(), ids=PATHS)
 def test_a_brush_touches_what_lies_within_its_radius_of_the_path(path, through):
     """Random Gaussians around the camera too, some in two thick layers; against a loop over each of them."""
-    rng = torch.Generator().manual_seed(3)
+    rng = seeded(3)
     means = torch.cat([4 * torch.rand(400, 3, generator=rng) - 2, _sheet(-0.4), _sheet(0.5)])
     means[:50, 1] -= 3  # behind the camera
     camera, sigma = _camera(), 0.03
@@ -97,7 +98,7 @@ def test_a_brush_does_not_reach_through_the_object():
     view = _view(sphere, camera=_camera(240, 180))
     everything = torch.tensor([[120.0, 90.0]])
     front = touched(view, everything, 300.0)
-    assert float(sphere[front, 1].max()) < 0.05
+    assert sphere[front, 1].max() < 0.05
     assert len(front) > 0.9 * (sphere[:, 1] < -0.8 * 0.8 / 3).sum()  # up to the horizon that the camera sees
     assert touched(view, everything, 300.0, through=True).tolist() == list(range(4000))
 
@@ -105,20 +106,20 @@ def test_a_brush_does_not_reach_through_the_object():
 def test_a_surface_is_all_in_front_seen_at_a_slant():
     """A sheet whose depth changes much from pixel to pixel."""
     view = _view(_sheet(0.0, 40), camera=_camera(eye=(2.7, -1.2, 0.0)))
-    assert bool(view.inside.all())
-    assert bool(view.front.all())
+    assert view.inside.all()
+    assert view.front.all()
 
 
 def test_what_shines_through_hides_nothing():
     both = torch.cat([_sheet(-0.4), _sheet(0.5)])
-    assert not bool(_view(both).front[24**2 :].any())
-    assert bool(_view(both, opacity=0.1).front[24**2 :].all())
+    assert not _view(both).front[24**2 :].any()
+    assert _view(both, opacity=0.1).front[24**2 :].all()
 
 
 def test_a_slack_adds_layers_just_behind():
     both = torch.cat([_sheet(0.0), _sheet(0.15)])
-    assert not bool(_view(both).front[24**2 :].any())
-    assert bool(_view(both, slack=0.2).front[24**2 :].all())
+    assert not _view(both).front[24**2 :].any()
+    assert _view(both, slack=0.2).front[24**2 :].all()
 
 
 def test_a_flat_gaussian_has_its_extent_along_the_line_of_sight():

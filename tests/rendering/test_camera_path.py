@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from shared import double, value_error
 
 from gaussian_swaying.captures.capture_camera import CaptureCamera
 from gaussian_swaying.rendering.cameras.camera import orbit_camera
@@ -23,7 +24,7 @@ def test_orbit_path_scales_with_the_object_and_turns_with_time():
         degrees_per_second=40.0,
         target_offset=(0.0, 0.5, 0.0),
     )
-    center, up = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64), torch.tensor([0.0, 0.0, 1.0])
+    center, up = double([1.0, 2.0, 3.0]), torch.tensor([0.0, 0.0, 1.0])
     camera = path(7, 2.0, center, up, 0.2)
     expected = orbit_camera((1.0, 2.1, 3.0), (0, 0, 1), 0.6, 90.0, 20.0, 30.0, 64, 48, dtype=torch.float64)
     assert camera.intrinsics.dtype == torch.float64
@@ -65,13 +66,13 @@ def test_bad_orbit_arguments(arguments, error, field):
 
 
 def test_bad_look_at_and_transforms_arguments():
-    with pytest.raises(ValueError, match="`eye`"):
+    with value_error("`eye`"):
         LookAtCamera((0, 0), (0, 0, 0))
-    with pytest.raises(ValueError, match="`eye` and `target`"):
+    with value_error("`eye` and `target`"):
         LookAtCamera((0, 0, 0), (0, 0, 0))
-    with pytest.raises(ValueError, match="`up`"):
+    with value_error("`up`"):
         LookAtCamera((0, 0, 1), (0, 0, 0), up=(0, 0, 0))
-    with pytest.raises(ValueError, match="`frame`"):
+    with value_error("`frame`"):
         TransformsCamera("transforms.json", -1)
     with pytest.raises(TypeError, match="`width`"):
         TransformsCamera("transforms.json", width=0.5)

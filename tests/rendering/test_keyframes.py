@@ -5,12 +5,13 @@ from itertools import pairwise
 
 import pytest
 import torch
+from shared import double, value_error
 
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
 from gaussian_swaying.rendering.cameras.keyframes import CameraKey, KeyframedCamera, interpolate_keys
 
-CENTER, UP = torch.zeros(3, dtype=torch.float64), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+CENTER, UP = torch.zeros(3).double(), double([0.0, 0.0, 1.0])
 TIMES = [0.0, 1.0, 1.5, 4.0]
 ROWS = [[0.0, 5.0], [2.0, -1.0], [3.0, 4.0], [3.0, 6.0]]
 
@@ -76,7 +77,7 @@ def test_eyes_look_at_their_targets():
     expected = look_at_camera([1.0, -3.0, 0.5], [0.0, 0.0, 0.5], UP, 40.0, 32, 18, dtype=torch.float64)
     torch.testing.assert_close(found.world_to_camera, expected.world_to_camera)
     lying = KeyframedCamera(keys, up=[1.0, 0.0, 0.0], width=32, height=18)(0, 0.0, CENTER, UP, 1.0)
-    torch.testing.assert_close(lying.world_to_camera[1, :3], torch.tensor([-1.0, 0.0, 0.0], dtype=torch.float64))
+    torch.testing.assert_close(lying.world_to_camera[1, :3], double([-1.0, 0.0, 0.0]))
 
 
 @pytest.mark.parametrize(
@@ -93,5 +94,5 @@ def test_eyes_look_at_their_targets():
     ],
 )
 def test_bad_keys(keys, words):
-    with pytest.raises(ValueError, match=words):
+    with value_error(words):
         KeyframedCamera(keys)

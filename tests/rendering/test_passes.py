@@ -30,7 +30,7 @@ def test_the_depth_of_a_wall():
     assert float(depth[16, 16]) == pytest.approx(2.0, rel=1e-5)  # along the axis, not the ray
     assert float(depth[12, 12]) == pytest.approx(2.0, rel=1e-5)
     assert float(depth[0, 0]) == 0.0
-    assert 0.05 < float((depth > 0).float().mean()) < 0.5
+    assert 0.05 < (depth > 0).float().mean() < 0.5
     near, far = depth_colors(depth, 1.0, 2.0), depth_colors(depth, 2.0, 3.0)
     torch.testing.assert_close(near[16, 16], colormap(torch.tensor(0.0)))
     torch.testing.assert_close(far[16, 16], colormap(torch.tensor(1.0)))
@@ -51,7 +51,7 @@ def test_colours_of_the_scale():
     assert torch.equal(colours[0], colours[1])
     assert torch.equal(colours[3], colours[4])
     luminance = colormap(torch.linspace(0, 1, 101)) @ torch.tensor([0.2126, 0.7152, 0.0722])
-    assert bool((luminance.diff() > 0).all())  # readable in grey too
+    assert (luminance.diff() > 0).all()  # readable in grey too
     blended = torch.tensor([[1.0, 4.0, 0.1]])
     alpha = torch.tensor([[[1.0], [0.8], [0.4]]])
     found = scalar_colors(blended, alpha, 2.0)

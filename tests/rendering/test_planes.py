@@ -4,13 +4,14 @@ import math
 
 import pytest
 import torch
+from shared import double, near, peak, rand, seeded
 
 from gaussian_swaying.geometry.rotations import rotation_from_z, rotation_to_quat
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.rendering.planes import depth_normals, pixel_rays, plane_channels, surface_maps
 from gaussian_swaying.rendering.torch_renderer import TorchRenderer
 
-NORMAL = torch.nn.functional.normalize(torch.tensor([0.3, -1.0, 0.2], dtype=torch.float64), dim=0)
+NORMAL = torch.nn.functional.normalize(double([0.3, -1.0, 0.2]), dim=0)
 OFFSET = 0.1  # [m] of the plane from the origin
 
 
@@ -20,16 +21,16 @@ def _camera(width=40, height=30):
 
 def _plane(count=2500, half=0.9):
     """Discs on a tilted plane, each turned about its normal at random."""
-    generator = torch.Generator().manual_seed(0)
-    flat = torch.rand(count, 2, generator=generator, dtype=torch.float64) * 2 * half - half
+    generator = seeded(0)
+    flat = rand(count, 2, generator=generator) * 2 * half - half
     frame = rotation_from_z(NORMAL)
     means = torch.nn.functional.pad(flat, (0, 1)) @ frame.T + OFFSET * NORMAL
-    angle = torch.rand(count, generator=generator, dtype=torch.float64) * 2 * math.pi
-    turn = torch.zeros(count, 3, 3, dtype=torch.float64)
+    angle = rand(count, generator=generator) * 2 * math.pi
+    turn = torch.zeros(count, 3, 3).double()
     turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1] = angle.cos(), -angle.sin(), angle.sin(), angle.cos()
     turn[:, 2, 2] = 1.0
     quats = rotation_to_quat(frame @ turn)
-    scales = torch.tensor([0.05, 0.04, 0.001], dtype=torch.float64).log().repeat(count, 1)
+    scales = double([0.05, 0.04, 0.001]).log().repeat(count, 1)
     return means, quats, scales
 
 
@@ -56,7 +57,7 @@ def test_discs_of_a_plane_show_that_plane():
     assert known.float().mean() > 0.5
     torch.testing.assert_close(maps.depth[known][:, 0], _true_depth(camera)[known], rtol=1e-6, atol=0)
     facing = camera.world_to_camera[:3, :3] @ NORMAL
-    torch.testing.assert_close(maps.unit[known], facing.expand(int(known.sum()), 3), rtol=0, atol=1e-6)
+    near(maps.unit[known], facing.expand(int(known.sum()), 3), 1e-6)
     assert (maps.distance[known] < 0).all()
     assert maps.depth[~known].eq(0).all()
 
@@ -73,7 +74,7 @@ def test_normals_of_depths_are_those_of_the_plane():
     assert int(inner.sum()) == (camera.height - 2) * (camera.width - 2) - 5
     facing = camera.world_to_camera[:3, :3] @ NORMAL
     found = normal[inner[..., 0]]
-    torch.testing.assert_close(found, facing.expand(len(found), 3), rtol=0, atol=1e-9)
+    near(found, facing.expand(len(found), 3), 1e-9)
 
 
 def test_a_picture_without_gaussians_shows_no_surface():
@@ -132,6 +133,6 @@ def test_gsplat_blends_the_same_channels():
     same = (ours.known == expected.known).float().mean()
     assert float(same) > 0.999
     known = ours.known & expected.known
-    assert float((ours.depth - expected.depth)[known].abs().max()) < 1e-4
+    assert peak((ours.depth - expected.depth)[known]) < 1e-4
     for one, two in zip(*gradients, strict=True):
         assert float((one - two).norm() / two.norm()) < 0.02

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from shared import near, seeded
 
 from gaussian_swaying.kernels.launch import compiles
 from gaussian_swaying.rendering import raster, torch_renderer
@@ -21,7 +22,7 @@ def _camera(width=61, height=43):
 
 
 def _scene(count=300, seed=3, size=0.08):
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     means = (torch.rand(count, 3, generator=generator) - 0.5) * 2.0
     factors = torch.randn(count, 3, 3, generator=generator) * size
     opacities = torch.rand(count, generator=generator)
@@ -45,8 +46,8 @@ def _agree(scene, camera, background=BACKGROUND, eps2d=0.3):
         assert found.dtype == torch.float32
         assert found.shape == getattr(pictures[0], name).shape
         errors = torch.stack([(found - getattr(picture, name)).abs() for picture in pictures])
-        assert float(errors.amin(0).max()) < limit, name
-        assert float((errors[0] < limit).double().mean()) > 0.999, name
+        assert errors.amin(0).max() < limit, name
+        assert (errors[0] < limit).double().mean() > 0.999, name
     return made
 
 
@@ -67,8 +68,8 @@ def test_pixels_end():
     means, covariances, opacities, colors = _scene(600, size=0.3)
     opacities = opacities * 0.1 + 0.9
     made = _agree((means, covariances, opacities, colors), _camera())
-    assert float((made.alpha > 0.999).float().mean()) > 0.5
-    assert float(made.alpha.min()) < 0.99
+    assert (made.alpha > 0.999).float().mean() > 0.5
+    assert made.alpha.min() < 0.99
 
 
 def test_thin_and_huge_gaussians():
@@ -129,7 +130,7 @@ def test_blur_and_background():
     scene, camera = _scene(), _camera()
     made = _agree(scene, camera, eps2d=2.0)
     black = raster.render(*scene, camera, None, 2.0)
-    torch.testing.assert_close(made.color, black.color + (1 - black.alpha) * BACKGROUND, rtol=0, atol=1e-6)
+    near(made.color, black.color + (1 - black.alpha) * BACKGROUND, 1e-6)
 
 
 def test_the_same_bits_for_any_number_of_threads():

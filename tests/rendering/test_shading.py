@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from shared import double, near, peak, rand, randn, value_error
 from torch.nn.functional import normalize
 
 from gaussian_swaying.rendering.shading import DiffuseShader, PhongShader, diffuse_shading, phong_shading
@@ -20,7 +21,7 @@ def _case(dtype, device="cpu"):
 
 
 def _random_normals(count=50):
-    return normalize(torch.randn(count, 3, dtype=torch.float64), dim=-1)
+    return normalize(randn(count, 3), dim=-1)
 
 
 def test_diffuse_is_the_cosine(device, dtype):
@@ -54,29 +55,29 @@ def test_light_is_normalised_and_negative_colours_are_clamped():
 
 def test_relative_diffuse_is_the_ratio_of_the_factors():
     color, normal, light = _case(torch.float64)
-    rest = torch.tensor([math.sin(1.0), 0.0, math.cos(1.0)], dtype=torch.float64)
+    rest = double([math.sin(1.0), 0.0, math.cos(1.0)])
     expected = color * math.cos(math.radians(30.0)) / math.cos(1.0)
     torch.testing.assert_close(diffuse_shading(color, normal, light, rest_normal=rest), expected)
-    grazing = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)  # factor 0, raised to 0.1
+    grazing = double([1.0, 0.0, 0.0])  # factor 0, raised to 0.1
     torch.testing.assert_close(diffuse_shading(color, light, light, rest_normal=grazing), 10.0 * color)
 
 
 @pytest.mark.parametrize("two_sided", [False, True])
 def test_relative_leaves_the_rest_picture_unchanged(two_sided):
-    normal, color, view = _random_normals(), torch.rand(50, 3, dtype=torch.float64), _random_normals()
+    normal, color, view = _random_normals(), rand(50, 3), _random_normals()
     for shader in (
         DiffuseShader((1.0, -2.0, 0.5), two_sided=two_sided, relative=True),
         PhongShader((1.0, -2.0, 0.5), k_a=0.0, two_sided=two_sided, relative=True),
     ):
-        torch.testing.assert_close(shader(color, normal, normal, view), color, rtol=0, atol=1e-15)
-        assert (shader(color, _random_normals(), normal, view) - color).abs().max() > 0.1
+        near(shader(color, normal, normal, view), color, 1e-15)
+        assert peak(shader(color, _random_normals(), normal, view) - color) > 0.1
 
 
 @pytest.mark.parametrize(
     "shader", [DiffuseShader((0, 1, 1), True, ambient=0.2), PhongShader((0, 1, 1), two_sided=True)]
 )
 def test_two_sided_does_not_see_the_sign_of_the_normal(shader):
-    normal, color, view = _random_normals(), torch.rand(50, 3, dtype=torch.float64), _random_normals()
+    normal, color, view = _random_normals(), rand(50, 3), _random_normals()
     torch.testing.assert_close(shader(color, normal, None, view), shader(color, -normal, None, view))
 
 
@@ -104,7 +105,7 @@ def test_phong_relative_subtracts_the_rest_highlight():
 
 
 def test_gradients():
-    color, normal, view = torch.rand(5, 3, dtype=torch.float64), _random_normals(5), _random_normals(5)
+    color, normal, view = rand(5, 3), _random_normals(5), _random_normals(5)
     color.requires_grad_()
     normal.requires_grad_()
     rest = _random_normals(5)
@@ -117,11 +118,11 @@ def test_gradients():
 
 @pytest.mark.parametrize("shader", [DiffuseShader, PhongShader])
 def test_bad_arguments(shader):
-    with pytest.raises(ValueError, match="`light`"):
+    with value_error("`light`"):
         shader(light=(0.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match="`light`"):
+    with value_error("`light`"):
         shader(light=(0.0, 1.0))
-    with pytest.raises(ValueError, match="`rest_normal`"):
+    with value_error("`rest_normal`"):
         shader(relative=True)(torch.ones(3), torch.ones(3), view_direction=torch.ones(3))
-    with pytest.raises(ValueError, match="`normal`"):
+    with value_error("`normal`"):
         shader()(torch.ones(3), torch.ones(2), view_direction=torch.ones(3))

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from shared import peak, seeded, value_error
 
 from gaussian_swaying.kernels.launch import compiles
 from gaussian_swaying.rendering import raster
@@ -22,7 +23,7 @@ def _camera(dtype=torch.float32):
 
 def _cloud(count, pixels, opacity=0.6, seed=0, dtype=torch.float32):
     """A ball of Gaussians of a size in pixels, with a colour that changes across it."""
-    draw = torch.Generator().manual_seed(seed)
+    draw = seeded(seed)
     means = torch.randn(count, 3, generator=draw, dtype=dtype) * 0.3
     focal = float(_camera().intrinsics[0, 0])
     # the root of the Frobenius norm of a ball's covariance is its deviation times the fourth root of three
@@ -48,7 +49,7 @@ def test_thinned_gaussians_look_like_all_of_them(pixels, least):
         render_torch(*each, camera, BACKGROUND).color for each in (given, some, [part[chosen] for part in given])
     )
     assert _psnr(made, full) > max(least, 4 + _psnr(left, full))
-    off, without = (float((one.mean((0, 1)) - full.mean((0, 1))).abs().max()) for one in (made, left))
+    off, without = (float(peak(one.mean((0, 1)) - full.mean((0, 1)))) for one in (made, left))
     assert off < min(0.05, 0.6 * without)  # brightness
 
 
@@ -76,7 +77,7 @@ def test_large_gaussians_are_drawn_as_they_are():
     small[0][3] = math.nan
     small[1][4] = math.inf
     assert len(thinned(*small, _camera())[0]) < 30
-    assert bool(torch.isfinite(TorchRenderer(detail=1.0)(*small, _camera()).color).all())
+    assert torch.isfinite(TorchRenderer(detail=1.0)(*small, _camera()).color).all()
 
 
 def test_the_same_gaussians_are_drawn_while_they_move():
@@ -94,7 +95,7 @@ def test_a_renderer_thins_only_if_it_is_told_to():
     assert torch.equal(rough.color, render_torch(*some, camera, background).color)
     assert not torch.equal(rough.color, TorchRenderer()(*given, camera, background).color)
     assert (TorchRenderer().detail, make_renderer("cpu").detail, make_renderer("cpu", detail=0.5).detail) == (0, 0, 0.5)
-    with pytest.raises(ValueError, match=r"`detail` to not be negative"):
+    with value_error(r"`detail` to not be negative"):
         TorchRenderer(detail=-1.0)
 
 
@@ -111,8 +112,8 @@ def test_kernels_thin_as_the_definition(opacity):
     assert 0.3 < len(some[0]) / 3_000 < 0.9
     expected = render_torch(*some, _camera(torch.float64), BACKGROUND.double())
     errors = (made.color - expected.color).abs()
-    assert float((errors < 2e-5).double().mean()) > 0.999
-    assert float(errors.max()) < 0.01
+    assert (errors < 2e-5).double().mean() > 0.999
+    assert errors.max() < 0.01
     assert torch.equal(
         raster.render(*given, camera, BACKGROUND, 0.3).color, TorchRenderer()(*given, camera, BACKGROUND).color
     )

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from shared import EYE, double, near, rand, randn, seeded, value_error
 from small_scenes import varied_cloud
 
 from gaussian_swaying.gaussians.harmonics import sh_to_color
@@ -23,11 +24,11 @@ def _camera():
 
 def _scene(count=40, dtype=torch.float64, device="cpu"):
     """Overlapping, opaque, faint, thin and diagonal, partly off-screen and near-plane Gaussians."""
-    generator = torch.Generator().manual_seed(3)
-    means = (torch.rand(count, 3, generator=generator, dtype=torch.float64) - 0.5) * 2.6
-    factors = torch.randn(count, 3, 3, generator=generator, dtype=torch.float64) * 0.15
-    opacities = torch.rand(count, generator=generator, dtype=torch.float64)
-    colors = torch.rand(count, 3, generator=generator, dtype=torch.float64)
+    generator = seeded(3)
+    means = (rand(count, 3, generator=generator) - 0.5) * 2.6
+    factors = randn(count, 3, 3, generator=generator) * 0.15
+    opacities = rand(count, generator=generator)
+    colors = rand(count, 3, generator=generator)
     opacities[:6] = 1.0
     opacities[6] = 0.003  # below 1/255
     factors[7:10] = torch.tensor([[0.6, 0, 0], [0, 0.6, 0], [0.6, 0, 0]]) * torch.tensor([1.0, 0.01, 1.0])  # needles
@@ -35,11 +36,11 @@ def _scene(count=40, dtype=torch.float64, device="cpu"):
     means[11] = torch.tensor([0.3, -4.0, 0.2])  # behind the camera
     means[12] = torch.tensor([0.25, -1.7, 0.3])  # just behind the near plane, beyond the field of view
     means[13] = torch.tensor([1.5, 0.0, 0.0])  # centre off-screen
-    factors[13] = torch.eye(3, dtype=torch.float64) * 0.4
+    factors[13] = EYE * 0.4
     means[14:18] *= 0.3  # large and opaque: they end the pixels behind them
-    factors[14:18] = torch.eye(3, dtype=torch.float64) * 0.3
+    factors[14:18] = EYE * 0.3
     opacities[14:18] = 1.0
-    covariances = factors @ factors.mT + 1e-6 * torch.eye(3, dtype=torch.float64)
+    covariances = factors @ factors.mT + 1e-6 * EYE
     return tuple(item.to(device, dtype) for item in (means, covariances, opacities, colors))
 
 
@@ -55,11 +56,11 @@ def _oracle(means, covariances, opacities, colors, camera, background, eps2d=0.3
             continue
         u = min((camera.width - cx) / fx + 0.3 * tan_x, max(-cx / fx - 0.3 * tan_x, x / z))
         v = min((camera.height - cy) / fy + 0.3 * tan_y, max(-cy / fy - 0.3 * tan_y, y / z))
-        jacobian = torch.tensor([[fx / z, 0, -fx * u / z], [0, fy / z, -fy * v / z]], dtype=torch.float64)
-        image = jacobian @ rotation @ covariance @ rotation.T @ jacobian.T + eps2d * torch.eye(2, dtype=torch.float64)
+        jacobian = double([[fx / z, 0, -fx * u / z], [0, fy / z, -fy * v / z]])
+        image = jacobian @ rotation @ covariance @ rotation.T @ jacobian.T + eps2d * torch.eye(2).double()
         splats.append((z, fx * x / z + cx, fy * y / z + cy, torch.linalg.inv(image).tolist(), opacity, color))
     splats.sort(key=lambda splat: splat[0])
-    color_image = torch.zeros(camera.height, camera.width, 3, dtype=torch.float64)
+    color_image = torch.zeros(camera.height, camera.width, 3).double()
     alpha_image, depth_image = color_image[..., :1].clone(), color_image[..., :1].clone()
     stopped = 0
     for row in range(camera.height):
@@ -84,7 +85,7 @@ def _oracle(means, covariances, opacities, colors, camera, background, eps2d=0.3
 
 def test_matches_the_loop_over_pixels(device, dtype):
     """Every rule of compositing occurs in the scene: see the assertions on the loop."""
-    background = torch.tensor([0.9, 0.1, 0.4], dtype=torch.float64)
+    background = double([0.9, 0.1, 0.4])
     color, alpha, depth, stopped = _oracle(*_scene(), _camera(), background)
     assert stopped > 10
     assert alpha.min() < 0.3
@@ -93,9 +94,9 @@ def test_matches_the_loop_over_pixels(device, dtype):
     assert result.color.dtype == dtype
     assert result.color.device.type == device.type
     tolerance = 1e-10 if dtype == torch.float64 else 2e-4
-    torch.testing.assert_close(result.color.cpu().double(), color, atol=tolerance, rtol=0)
-    torch.testing.assert_close(result.alpha.cpu().double(), alpha, atol=tolerance, rtol=0)
-    torch.testing.assert_close(result.depth.cpu().double(), depth, atol=tolerance * 4, rtol=0)
+    near(result.color.cpu().double(), color, tolerance)
+    near(result.alpha.cpu().double(), alpha, tolerance)
+    near(result.depth.cpu().double(), depth, tolerance * 4)
 
 
 def test_an_opaque_gaussian_lets_a_thousandth_through():
@@ -116,7 +117,7 @@ def test_projection_is_sorted_and_keeps_what_is_seen():
 def test_memory_limit_does_not_change_the_picture(max_pairs):
     expected, result = render_torch(*_scene(), _camera()), TorchRenderer(max_pairs=max_pairs)(*_scene(), _camera())
     for name in ("color", "alpha", "depth"):
-        torch.testing.assert_close(getattr(result, name), getattr(expected, name), atol=1e-12, rtol=0)
+        near(getattr(result, name), getattr(expected, name), 1e-12)
 
 
 def test_deterministic_bit_for_bit():
@@ -153,16 +154,16 @@ def test_bad_gaussians_do_not_poison_the_picture():
             extra = [item[:1].clone() for item in scene]
             extra[field].fill_(value)
             result = render_torch(*(torch.cat(pair) for pair in zip(scene, extra, strict=True)), _camera())
-            torch.testing.assert_close(result.color, expected.color, atol=1e-12, rtol=0)
-    huge = (scene[0][:1], torch.eye(3).double()[None] * 1e305, scene[2][:1], scene[3][:1])
+            near(result.color, expected.color, 1e-12)
+    huge = (scene[0][:1], EYE[None] * 1e305, scene[2][:1], scene[3][:1])
     assert render_torch(*huge, _camera()).color.isfinite().all()
 
 
 def test_gradcheck():
     means, covariances, opacities, colors = (item[[20, 21, 22, 23]].clone() for item in _scene())
     means *= 0.4  # inside the image
-    factors = torch.linalg.cholesky(covariances + 0.02 * torch.eye(3).double())
-    background = torch.rand(3, dtype=torch.float64)
+    factors = torch.linalg.cholesky(covariances + 0.02 * EYE)
+    background = rand(3)
     inputs = (means, factors, 0.2 + 0.6 * opacities, colors, background)
     for item in inputs:
         item.requires_grad_()
@@ -178,7 +179,7 @@ def test_gradcheck():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_one_bad_number_makes_a_gaussian_not_finite(dtype, device):
     means, covariances, opacities, colors = fields = _scene(80, dtype, device)
-    assert bool(finite_gaussians(*fields).all())
+    assert finite_gaussians(*fields).all()
     covariances[0, 0, 0] = torch.finfo(dtype).max  # huge, yet a number
     expected = torch.ones(80, dtype=torch.bool)
     row = 1
@@ -211,7 +212,7 @@ def test_gradients_are_finite_where_gaussians_are_dropped():
 def test_bad_shapes_are_named(field, name):
     scene = [*_scene(), torch.zeros(3)]
     scene[field] = torch.zeros(7, 7)
-    with pytest.raises(ValueError, match=f"`{name}`"):
+    with value_error(f"`{name}`"):
         render_torch(*scene[:4], _camera(), scene[4])
     scene[field] = [1.0]
     with pytest.raises(TypeError, match=f"`{name}`"):
@@ -243,5 +244,5 @@ def test_a_splat_as_it_is_stored():
     # the centres on the screen are those of a pinhole
     pinhole = project(means, camera)[0][screen.index].float()
     torch.testing.assert_close(screen.means2d.detach(), pinhole, rtol=1e-4, atol=1e-3)
-    with pytest.raises(ValueError, match="no absolute gradients"):
+    with value_error("no absolute gradients"):
         renderer.render_splat(*tensors, camera, absgrad=True)

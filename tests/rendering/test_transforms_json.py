@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from shared import value_error
 
 from gaussian_swaying.rendering.cameras.camera_path import TransformsCamera
 from gaussian_swaying.rendering.cameras.transforms_json import camera_from_transforms
@@ -42,7 +43,7 @@ def test_transforms_instant_ngp_rescales_and_overrides(tmp_path):
     tall = camera_from_transforms(path, 0, 100, 100)
     torch.testing.assert_close(tall.intrinsics, torch.tensor([[100.0, 0, 49.5], [0, 210, 52], [0, 0, 1]]))
     moving = TransformsCamera(path, 1, height=50)
-    center = torch.zeros(3, dtype=torch.float64)
+    center = torch.zeros(3).double()
     for frame in range(2):
         camera = moving(frame, 0.1 * frame, center, center, 1.0)
         torch.testing.assert_close(camera.intrinsics, half.intrinsics.double())
@@ -73,16 +74,16 @@ GOOD = {"camera_angle_x": 0.8, "w": 8, "h": 6, "frames": [{"transform_matrix": P
 )
 def test_bad_transforms_are_named(tmp_path, change, frame, message):
     path = _write(tmp_path, **{**GOOD, **change})
-    with pytest.raises(ValueError, match=message) as info:
+    with value_error(message) as info:
         camera_from_transforms(path, frame)
     assert str(path) in str(info.value)
 
 
 def test_unreadable_transforms_are_named(tmp_path):
-    with pytest.raises(ValueError, match=r"missing\.json.*check the path"):
+    with value_error(r"missing\.json.*check the path"):
         camera_from_transforms(tmp_path / "missing.json", 0)
     (tmp_path / "broken.json").write_text("{frames")
-    with pytest.raises(ValueError, match=r"broken\.json.*not valid JSON"):
+    with value_error(r"broken\.json.*not valid JSON"):
         camera_from_transforms(tmp_path / "broken.json", 0)
     with pytest.raises(TypeError, match="`frame`"):
         camera_from_transforms(_write(tmp_path, **GOOD), 0.5)

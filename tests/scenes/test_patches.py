@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from shared import double
+from shared import double, near, normalized, peak
 from torch.testing import assert_close
 
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
@@ -19,7 +19,7 @@ def test_a_tube_has_the_area_and_the_normals_of_a_cylinder():
     for spacing in (0.5, 0.05):
         patches = tube([[0, 0, 0], [0, 0, 2.0]], [0.3, 0.3], spacing)
         assert float(patches.area.sum()) == pytest.approx(2 * math.pi * 0.3 * 2.0, rel=EXACT)
-        radial = torch.nn.functional.normalize(patches.center * double([1.0, 1.0, 0.0]), dim=-1)
+        radial = normalized(patches.center * double([1.0, 1.0, 0.0]))
         assert_close(patches.normal, radial)
 
 
@@ -29,7 +29,7 @@ def test_a_bent_tube_keeps_the_area_of_a_torus_piece():
     path = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], dim=-1)
     patches = tube(path, torch.full((200,), 0.1), 0.05)
     assert float(patches.area.sum()) == pytest.approx(math.pi / 2 * 2 * math.pi * 0.1, rel=0.01)
-    ring = torch.nn.functional.normalize(patches.center * double([1.0, 1.0, 0.0]), dim=-1)
+    ring = normalized(patches.center * double([1.0, 1.0, 0.0]))
     outside = ((patches.center - ring) * patches.normal).sum(-1)
     assert outside.min() > 0
 
@@ -39,10 +39,10 @@ def test_an_ellipsoid_faces_outwards_and_a_sphere_has_its_area():
     # frustums of height h = 0.05 in a sphere of radius 0.5 lack (h / r)^2 / 8 = 1.3e-3
     assert float(sphere.area.sum()) == pytest.approx(4 * math.pi * 0.25, rel=2e-3)
     offset = sphere.center - double([1.0, 2.0, 3.0])
-    assert (torch.nn.functional.normalize(offset, dim=-1) * sphere.normal).sum(-1).min() > 0.99
+    assert (normalized(offset) * sphere.normal).sum(-1).min() > 0.99
     long = ellipsoid((0.0, 0.0, 0.0), (0.5, 0.2, 0.1), 0.05)
     gradient = long.center / double([0.25, 0.04, 0.01])
-    assert (torch.nn.functional.normalize(gradient, dim=-1) * long.normal).sum(-1).min() > 0.95
+    assert (normalized(gradient) * long.normal).sum(-1).min() > 0.95
 
 
 def test_a_box_is_closed():
@@ -57,7 +57,7 @@ def test_a_disc_faces_up():
     patches = disc((1.0, 0.0, 2.0), 0.3, 0.02)
     assert float(patches.area.sum()) == pytest.approx(math.pi * 0.09, rel=1e-9)
     assert_close(patches.normal, double([0.0, 0.0, 1.0]).expand(len(patches), 3))
-    assert (patches.center[:, 2] - 2.0).abs().max() == 0
+    assert peak(patches.center[:, 2] - 2.0) == 0
 
 
 @pytest.mark.parametrize("spacing", [0.2, 0.02, 0.004])
@@ -72,7 +72,7 @@ def test_a_flat_leaf_has_the_area_of_its_outline(spacing, leaf_area):
 def test_a_pot_holds_its_earth():
     patches = pot(0.3, 0.1, 0.2, 0.02)
     earth = patches.colour[:, 0] < 0.3
-    assert_close(patches.center[earth, 2].double(), torch.full((int(earth.sum()),), 0.276, dtype=torch.float64))
+    assert_close(patches.center[earth, 2].double(), double([0.276] * int(earth.sum())))
     assert patches.center[:, 2].min() > 0
     assert patches.center[:, 2].max() <= 0.3
 
@@ -91,7 +91,7 @@ def test_copies_turn_and_tint_the_template():
     template = disc((0.0, 0.0, 0.0), 0.1, 0.05, (0.5, 0.5, 0.5))
     up = double([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     axes = facing(double([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), up)
-    assert_close(torch.linalg.det(axes), torch.ones(2, dtype=torch.float64))
+    assert_close(torch.linalg.det(axes), torch.ones(2).double())
     tint = double([[1.0, 1.0, 1.0], [0.5, 1.0, 2.0]])
     both = copies(template, axes, double([1.0, 2.0]), torch.zeros(2, 3).double(), tint)
     first, second = both.area.reshape(2, -1)
@@ -106,13 +106,13 @@ def test_the_cloud_has_the_patches_normals_sizes_and_light():
     patches = box((0, 0, 0), (0.4, 0.2, 0.1), 0.1, (0.6, 0.6, 0.6))
     cloud = to_cloud(patches, overlap=0.5, ambient=0.3, two_sided=False)
     model = GaussianSurfaceModel.from_cloud(cloud, requires_grad=False)
-    assert_close(model.normals().double(), patches.normal, atol=1e-6, rtol=0)
+    near(model.normals().double(), patches.normal, 1e-6)
     scales = cloud.scales.exp().sort(-1).values
-    assert_close(scales[:, 1:], torch.full((len(patches), 2), 0.05), atol=1e-6, rtol=0)
-    assert_close(scales[:, 0], torch.full((len(patches),), 0.005), atol=1e-6, rtol=0)
+    near(scales[:, 1:], torch.full((len(patches), 2), 0.05), 1e-6)
+    near(scales[:, 0], torch.full((len(patches),), 0.005), 1e-6)
     colours = model.colors(torch.tensor([0.0, 0.0, 1.0]))
     bottom, top = (patches.normal[:, 2] < -0.5), (patches.normal[:, 2] > 0.5)
-    assert_close(colours[bottom], torch.full((int(bottom.sum()), 3), 0.18), atol=1e-6, rtol=0)
+    near(colours[bottom], torch.full((int(bottom.sum()), 3), 0.18), 1e-6)
     assert colours[top].min() > 0.3
     assert len(join([patches, patches])) == 2 * len(patches)
 
@@ -133,4 +133,4 @@ def test_a_curve_of_bezier_meets_its_ends():
 def test_revolution_of_a_slanted_line_is_a_cone():
     patches = revolution([[0.3, 0.0], [0.0, 0.4]], 0.05)
     assert float(patches.area.sum()) == pytest.approx(math.pi * 0.3 * 0.5, rel=1e-9)
-    assert (patches.normal[:, 2] - 0.6).abs().max() < 1e-9
+    assert peak(patches.normal[:, 2] - 0.6) < 1e-9

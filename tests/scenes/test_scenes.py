@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from shared import alike, double, peak, value_error
 from torch.testing import assert_close
 
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
@@ -45,7 +46,7 @@ def test_a_scene_is_a_usable_splat(scene):
     coarse = scene(spacing=0.2).generate().means
     assert 1.3 * len(coarse) < len(cloud)
     for side in (torch.amin, torch.amax):
-        assert (side(coarse, 0) - side(cloud.means, 0)).abs().max() < 0.25
+        assert peak(side(coarse, 0) - side(cloud.means, 0)) < 0.25
 
 
 @pytest.mark.parametrize("scene", SCENES)
@@ -95,13 +96,13 @@ def test_the_wind_reaches_three_layers_of_sand_that_share_its_surface():
     bear = cloud.select(cloud.means[:, 2] > 0)
     speck = bear.scales.amax(-1).exp() < 0.003
     areas = GaussianSurfaceModel.from_cloud(bear, requires_grad=False).areas("paper").double()
-    assert areas[speck].sum() < 0.01 * float(areas.sum())
+    assert areas[speck].sum() < 0.01 * areas.sum()
     skin = SandScene(spacing=0.02, interior=False).generate()
     skin = skin.select(skin.means[:, 2] > 0)
     # each of the skin stands for a third of a square of the spacing seen from above; pi 0.55^2 = 0.95 of its area
     own = GaussianSurfaceModel.from_cloud(skin, requires_grad=False).areas("paper").double()
     surface = 0.02**2 / skin.normals[:, 2].double() * math.pi * 0.55**2
-    assert_close(own, surface / 3, rtol=1e-4, atol=0)
+    alike(own, surface / 3, 1e-4)
     # the layers below are level, and missing where the bear is thin
     assert 0.65 < areas.sum() / surface.sum() < 1.0
     depth = scene.height(*bear.means[~speck, :2].double().T) - bear.means[~speck, 2].double()
@@ -151,7 +152,7 @@ def test_a_floor_runs_into_the_sky_and_bears_a_shadow():
     ground = floor(0.05, (0.5, 0.4, 0.3), [(0.5, 0.0, 0.1, 0.6)], fade=(1.0, 3.0))
     r = ground.center.norm(dim=-1)
     shown = baked(ground, 0.45, two_sided=True)
-    assert (shown[r > 3.0] - torch.tensor(SKY, dtype=torch.float64)).abs().max() < 1e-9
+    assert peak(shown[r > 3.0] - double(SKY)) < 1e-9
     assert r.max() > 12
     spot = (ground.center - torch.tensor([0.5, 0.0, 0.0]).double()).norm(dim=-1)
     dark, light = shown[spot < 0.04].mean(), shown[(spot > 0.3) & (r < 0.9)].mean()
@@ -190,7 +191,7 @@ def test_ups_are_up():
     ],
 )
 def test_bad_arguments_are_refused(scene, name, value):
-    with pytest.raises(ValueError, match=rf"generator\.{name}"):
+    with value_error(rf"generator\.{name}"):
         scene(**{name: value})
 
 
@@ -198,7 +199,7 @@ def test_plants_stand_in_a_row():
     cloud = PlantRowScene(count=3, spacing=0.05, leaves=20).generate()
     plants = cloud.means[cloud.means[:, 2] > 0.3]
     assert {round(float(x) / 0.6) for x in plants[:, 0]} == {-1, 0, 1}
-    assert plants[:, 1].abs().max() < 0.35
+    assert peak(plants[:, 1]) < 0.35
     assert 1.0 < plants[:, 2].max() < 1.4
     assert plants[:, 0].mean().abs() < 0.03
 

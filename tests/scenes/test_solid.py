@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from torch.testing import assert_close
+from shared import near, normalized, peak, value_error
 
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.geometry.patches import smallest_axis_normal
@@ -19,7 +19,7 @@ def test_a_shell_lies_on_the_surface(shape):
     scene = SolidScene(shape, spacing=0.05, gaussians="shell")
     cloud = scene.generate()
     assert len(cloud) > 300
-    assert scene.distance(cloud.means.double()).abs().max() < (1e-3 if shape == "figure" else 1e-6)
+    assert peak(scene.distance(cloud.means.double())) < (1e-3 if shape == "figure" else 1e-6)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -36,14 +36,14 @@ def test_gaussians_throughout_are_the_shell_and_a_core(shape):
 def test_normals_are_true():
     """On the ball radial, on the torus away from the ring, and along the shortest axis of each Gaussian."""
     ball = SolidScene("ball", spacing=0.05, gaussians="shell").generate()
-    assert_close(ball.normals, torch.nn.functional.normalize(ball.means, dim=-1), rtol=0, atol=1e-4)
+    near(ball.normals, normalized(ball.means), 1e-4)
     torus = SolidScene("torus", spacing=0.05, gaussians="shell").generate()
-    ring = torch.nn.functional.normalize(torus.means * torch.tensor([1.0, 1.0, 0.0]), dim=-1) * 0.5 / 1.3
-    expected = torch.nn.functional.normalize(torus.means - ring, dim=-1)
-    assert_close(torus.normals, expected, rtol=0, atol=1e-4)
+    ring = normalized(torus.means * torch.tensor([1.0, 1.0, 0.0])) * 0.5 / 1.3
+    expected = normalized(torus.means - ring)
+    near(torus.normals, expected, 1e-4)
     for cloud in (ball, torus, SolidScene(spacing=0.05).generate()):
         along = (smallest_axis_normal(cloud.quats, cloud.scales) * cloud.normals).sum(-1)
-        assert_close(along, torch.ones(len(cloud)), rtol=0, atol=1e-5)
+        near(along, torch.ones(len(cloud)), 1e-5)
 
 
 def test_the_shell_covers_the_surface():
@@ -71,5 +71,5 @@ def test_the_same_arguments_give_the_same_splat():
     ],
 )
 def test_bad_settings_are_refused(settings, words):
-    with pytest.raises(ValueError, match=words):
+    with value_error(words):
         SolidScene(**settings)

@@ -3,6 +3,7 @@
 import lightning
 import pytest
 import torch
+from shared import seeded
 from torch.utils.data import DataLoader, Dataset
 
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
@@ -46,7 +47,7 @@ class FlagData(lightning.LightningDataModule):
         self.points = points
 
     def initial_cloud(self, sh_degree):
-        generator = torch.Generator().manual_seed(3)
+        generator = seeded(3)
         points = torch.rand(self.points, 3, generator=generator) * torch.tensor([1.2, 0.1, 0.8])
         points -= torch.tensor([0.0, 0.05, 0.0])
         return gaussians_from_points(points, torch.full((self.points, 3), 0.5), sh_degree)

@@ -5,6 +5,7 @@ import traceback
 
 import pytest
 import torch
+from shared import value_error
 
 from gaussian_swaying.training.checkpoints import PlainCheckpoints, read_training_checkpoint
 from gaussian_swaying.training.densification import PARAMETERS
@@ -25,7 +26,7 @@ def file(tmp_path):
 
 
 def _refused(file, case):
-    with pytest.raises(ValueError, match=r"^[^\n]*step\.ckpt [^\n]*give another `--ckpt_path`\.$"):
+    with value_error(r"^[^\n]*step\.ckpt [^\n]*give another `--ckpt_path`\.$"):
         PlainCheckpoints().load_checkpoint(str(file))
     return case
 
@@ -63,6 +64,6 @@ def test_something_else(file):
 def test_no_advice_to_execute_the_code_in_a_file(file):
     """PyTorch's own message names the argument that would."""
     PlainCheckpoints().save_checkpoint(_held() | {"hyper_parameters": random.Random(0)}, str(file))
-    with pytest.raises(ValueError, match=r"more than tensors, numbers and text, which is never loaded") as caught:
+    with value_error(r"more than tensors, numbers and text, which is never loaded") as caught:
         PlainCheckpoints().load_checkpoint(str(file))
     assert "weights_only" not in "".join(traceback.format_exception(caught.value, limit=0))

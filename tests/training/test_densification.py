@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from shared import seeded, value_error
 
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.rendering.protocol import ScreenGaussians
@@ -89,9 +90,9 @@ def test_opacities_are_reset_only_if_asked_for():
 
 def test_what_needs_cuda_says_so():
     model = _model()
-    with pytest.raises(ValueError, match=r"MCMCDensification needs CUDA.*use DefaultDensification"):
+    with value_error(r"MCMCDensification needs CUDA.*use DefaultDensification"):
         MCMCDensification().attach(model, _optimizer(model), 1.0)
-    with pytest.raises(ValueError, match=r"`densification.absgrad` needs CUDA"):
+    with value_error(r"`densification.absgrad` needs CUDA"):
         DefaultDensification(absgrad=True).attach(model, _optimizer(model), 1.0)
 
 
@@ -112,7 +113,7 @@ def test_foreign_optimizers_are_refused():
     short = _optimizer(model)
     del short.param_groups[-1]
     for foreign, other in ((optimizer, _model()), (one_group, model), (short, model)):
-        with pytest.raises(ValueError, match="one group for each of means, scales, quats, opacities, sh0, shN of the"):
+        with value_error("one group for each of means, scales, quats, opacities, sh0, shN of the"):
             DefaultDensification().attach(other, foreign, 1.0)
 
 
@@ -172,7 +173,7 @@ def test_sums_of_gradients_without_waiting_are_those_of_gsplat():
     ours, theirs = DefaultDensification().make_strategy(torch.device("cpu")), DefaultStrategy()
     parameters = {"means": torch.zeros(50, 3)}
     states = [strategy.initialize_state(scene_scale=1.0) for strategy in (ours, theirs)]
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     for _ in range(4):
         means2d = torch.rand(1, 50, 2, generator=generator)
         means2d.grad = torch.randn(1, 50, 2, generator=generator)

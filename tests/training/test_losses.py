@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from shared import double
+from shared import double, randn, value_error
 from torch.testing import assert_close
 
 from gaussian_swaying.metrics.ssim import ssim_map
@@ -80,7 +80,7 @@ def test_anisotropy_by_hand(order):
 
 
 def test_entropy_by_hand():
-    values = torch.tensor([0.0, 1.0, 0.5, 1 / math.e], dtype=torch.float64, requires_grad=True)
+    values = double([0.0, 1.0, 0.5, 1 / math.e]).requires_grad_()
     result = _of_each(opacity_entropy_loss, values)
     expected = double([0.0, 0.0, 0.5 * math.log(2), 1 / math.e])
     assert_close(result, expected, rtol=1e-9, atol=2e-6)
@@ -103,7 +103,7 @@ def test_no_gaussians_cost_nothing():
 
 
 def test_scale_gradients():
-    scales = torch.randn(6, 3, dtype=torch.float64, requires_grad=True)
+    scales = randn(6, 3, requires_grad=True)
     for function in (anisotropy_loss, lambda s: anisotropy_loss(s, ratio="max_min"), size_loss):
         assert torch.autograd.gradcheck(function, scales)
 
@@ -173,7 +173,7 @@ def test_total_with_a_term_of_ones_own():
     ],
 )
 def test_bad_terms(make, words):
-    with pytest.raises(ValueError, match=words):
+    with value_error(words):
         make()
 
 

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from shared import value_error
 
 from gaussian_swaying.rendering.protocol import ScreenGaussians
 from gaussian_swaying.training.optimizers import GaussianAdam
@@ -50,7 +51,7 @@ def test_one_adam_is_six():
 
 
 def test_the_selective_one_needs_a_gpu():
-    with pytest.raises(ValueError, match="`optimizer` selective_adam needs CUDA"):
+    with value_error("`optimizer` selective_adam needs CUDA"):
         GaussianAdam([torch.ones(3)], [0.1], "selective_adam")
 
 

@@ -4,6 +4,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from shared import value_error
 
 from gaussian_swaying.runs.folder import MARKER
 from gaussian_swaying.runs.lock import FolderLocked
@@ -48,7 +49,7 @@ def test_a_folder_that_holds_the_photos(tmp_path, capsys):
     """The first training may be written beside them; a second one must not move them away."""
     (tmp_path / "images").mkdir()
     _begin(tmp_path, data=tmp_path / "images").release()
-    with pytest.raises(ValueError, match=r"images is in it and is needed now: choose another with --trainer.default"):
+    with value_error(r"images is in it and is needed now: choose another with --trainer.default"):
         _begin(tmp_path, data=tmp_path / "images")
     assert not (tmp_path / ".gaussian_swaying.lock").exists()
     _begin(tmp_path, ckpt=tmp_path / "checkpoints/step_000010.ckpt", data=tmp_path / "images").release()

@@ -7,7 +7,7 @@ from functools import cache
 import pytest
 import torch
 from lightning.pytorch.loggers import Logger
-from shared import double
+from shared import double, seeded, value_error
 from torch.testing import assert_close
 
 from gaussian_swaying.captures.capture import neighbouring_views
@@ -89,8 +89,8 @@ def test_the_photometric_term_is_least_at_the_true_plane():
     values = [float(_seeded(term, _inputs(math.radians(degrees)))) for degrees in (-1.5, -0.7, 0.0, 0.7, 1.5)]
     assert values[0] > 1.1 * values[1] > 1.1 * values[2]
     assert values[4] > 1.1 * values[3] > 1.1 * values[2]
-    tilt = torch.tensor(math.radians(1.0), dtype=torch.float64, requires_grad=True)
-    shift = torch.tensor(0.002, dtype=torch.float64, requires_grad=True)
+    tilt = double(math.radians(1.0)).requires_grad_()
+    shift = double(0.002).requires_grad_()
     descent = torch.optim.Adam([tilt, shift], lr=1e-3)
     for _ in range(40):
         descent.zero_grad()
@@ -174,7 +174,7 @@ def test_only_patches_that_both_pictures_show_are_compared():
     camera = look_at_camera((0.0, -2.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 40.0, 64, 48, dtype=torch.float64)
     step = 8 * 2.0 / float(camera.intrinsics[0, 0])
     aside = look_at_camera((step, -2.0, 0.0), (step, 0.0, 0.0), (0.0, 0.0, 1.0), 40.0, 64, 48, dtype=torch.float64)
-    wide = torch.rand(48, 72, 1, generator=torch.Generator().manual_seed(0)).double().expand(48, 72, 3)
+    wide = torch.rand(48, 72, 1, generator=seeded(0)).double().expand(48, 72, 3)
     own, moved = wide[:, :64], wide[:, 8:].clone()
     depth = torch.full((48, 64, 1), 2.0, dtype=torch.float64)
     unit = double([0.0, 0.0, -1.0]).expand(48, 64, 3)
@@ -301,11 +301,11 @@ def test_terms_begin_at_their_step_and_say_what_they_need():
     total, values = loss(inputs)
     assert set(values) == {"rgb", "anisotropy", "entropy", "size", "normal"}
     assert torch.isfinite(total)
-    with pytest.raises(ValueError, match=r"LossInputs\.surface"):
+    with value_error(r"LossInputs\.surface"):
         DepthNormalLoss(0)(_inputs(surface=None))
-    with pytest.raises(ValueError, match="radius"):
+    with value_error("radius"):
         MultiViewPhotometricLoss(radius=0)
-    with pytest.raises(ValueError, match="start"):
+    with value_error("start"):
         DepthNormalLoss(start=-1)
 
 
@@ -366,7 +366,7 @@ def test_a_training_with_all_terms_on_a_gpu(data, make_trainer):
 )
 def test_bad_times_of_terms(options, words):
     for kind in (DepthNormalLoss, MultiViewGeometricLoss, MultiViewPhotometricLoss):
-        with pytest.raises(ValueError, match=words):
+        with value_error(words):
             kind(**options)
 
 

@@ -5,6 +5,7 @@ import urllib.error
 import urllib.request
 
 import pytest
+from shared import value_error
 
 pytest.importorskip("viser", reason="needs the extra [viewer]")
 from gaussian_swaying.viewer.door import Door, check_address
@@ -98,7 +99,7 @@ def test_a_page_for_other_computers_needs_the_token_of_its_link(open_page, conne
 
 @pytest.mark.parametrize(("host", "port", "field"), [("127.0.0.1", 70000, "--port"), ("10.99.99.99", 8080, "--host")])
 def test_an_address_that_cannot_be_is_refused(host, port, field):
-    with pytest.raises(ValueError, match=field):
+    with value_error(field):
         check_address(host, port)
 
 

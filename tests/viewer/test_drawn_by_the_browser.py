@@ -4,8 +4,8 @@ import time
 
 import numpy as np
 import pytest
-import torch
-from browsers import picture_of, until
+from browsers import picture_of, reached, until
+from shared import double, longest, peak
 
 pytest.importorskip("viser", reason="needs the extra [viewer]")
 from gaussian_swaying.viewer.film.page import PAGE
@@ -148,7 +148,7 @@ def test_a_state_with_the_same_time_replaces_the_last(blank):
 
 def _centres(window):
     window.wait_for_function("wind.left === 0 && wind.drawing.sorted")
-    return torch.tensor(window.evaluate("Array.from(wind.positions())"), dtype=torch.float64).reshape(-1, 3)
+    return double(window.evaluate("Array.from(wind.positions())")).reshape(-1, 3)
 
 
 def _picture(window):
@@ -158,7 +158,7 @@ def _picture(window):
 def test_the_canvas_shows_the_state_as_the_server_draws_it(page, drawing):
     """Centres from the GPU, and the picture, of a paused flag, from another side than at first."""
     session, window = page.session, drawing
-    until(lambda: session.snapshot.health.time > 0.2)
+    reached(session, 0.2)
     pause(session)
     (client,) = page.server.get_clients().values()
     wanted = client.camera.position + np.array([0.3, 0.1, 0.2])
@@ -171,8 +171,8 @@ def test_the_canvas_shows_the_state_as_the_server_draws_it(page, drawing):
     scene = snapshot.simulation.scene
     size = scene.size * scene.frame.metres_per_unit
     expected = scene.frame.point_to_sim(scene.deformed(snapshot.state).means.double()) / size
-    assert float((_centres(window) - expected[order_of(scene)[1]]).norm(dim=-1).max()) < 1e-3  # of the object's size
-    assert float((expected - scene.frame.point_to_sim(scene.rest().means.double()) / size).abs().max()) > 0.02
+    assert longest(_centres(window) - expected[order_of(scene)[1]]) < 1e-3  # of the object's size
+    assert peak(expected - scene.frame.point_to_sim(scene.rest().means.double()) / size) > 0.02
     there = _picture(window)
     assert there.std() > 20
     page.largest = 1000

@@ -7,9 +7,9 @@ import urllib.error
 import urllib.request
 
 import pytest
-import torch
 import yaml
-from browsers import until
+from browsers import reached, until
+from shared import double
 
 from gaussian_swaying.rendering.cameras.camera import project
 from gaussian_swaying.viewer.session import Session
@@ -78,7 +78,7 @@ def test_a_client_that_reads_nothing_slows_nobody(page, connect):
 def test_the_page_moves_pauses_and_steps(page, window):
     session = page.session
     first = _seen(window)
-    until(lambda: session.snapshot.health.time > 0.2)
+    reached(session, 0.2)
     until(lambda: _seen(window) != first)
     window.get_by_role("button", name="Pause").click()
     until(lambda: session.paused)
@@ -146,8 +146,8 @@ def test_a_click_takes_hold_of_the_flag(page, window):
     pixel, _ = project(wanted[None], camera)
     window.mouse.click(*pixel[0].tolist())
     until(lambda: session.pulls and holding._handle is not None and not holding.release.disabled, 60)
-    grabbed = torch.tensor(holding._handle.position, dtype=torch.float64)
-    assert float((grabbed - wanted).norm()) < 0.05 * scene.size
+    grabbed = double(holding._handle.position)
+    assert (grabbed - wanted).norm() < 0.05 * scene.size
     window.mouse.click(10, height - 10)  # beside the object: what is held stays held
     let_go = window.get_by_role("button", name="Let go of it")
     until(let_go.is_enabled, 60)  # a slow browser hears of it later

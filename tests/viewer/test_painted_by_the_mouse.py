@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from browsers import picture_of, until
+from browsers import picture_of, reached, until
 
 from gaussian_swaying.gaussians.parts import ROLES, Parts
 from gaussian_swaying.rendering.cameras.camera import project
@@ -69,7 +69,7 @@ def _stroke(window, a, b):
 def test_a_stroke_is_seen_undone_saved_and_applied(page, window, tmp_path):
     """What was painted as held stays exactly where it is in the wind, while the rest moves."""
     session, painting = page.session, page.controls.painting
-    until(lambda: session.snapshot.health.time > 0.1)
+    reached(session, 0.1)
     page.controls.arrow.value = False  # what viser draws above the object is made again with each simulation
     page.controls.draw_handles()
     _begin(page, window)

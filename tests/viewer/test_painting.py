@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from browsers import until
+from browsers import reached, until
 
 pytest.importorskip("viser", reason="needs the extra [viewer]")
 from websockets.exceptions import ConnectionClosed
@@ -50,7 +50,7 @@ class Painter:
 
 def message(turn, *path, camera=CAMERA, **fields):
     view = camera.world_to_camera
-    matrix = torch.eye(4, dtype=torch.float64)
+    matrix = torch.eye(4).double()
     matrix[:3, :3] = turn @ view[:3, :3].T @ torch.diag(torch.tensor([1.0, -1.0, -1.0]).double())
     matrix[:3, 3] = turn @ camera.position
     told = {"kind": "stroke", "first": True, "path": [list(map(float, place)) for place in path], "size": SIZE}
@@ -102,7 +102,7 @@ def test_while_it_is_painted_the_object_is_at_rest_and_then_it_goes_on(page, joi
     painter = _joined(page, join)
     client = painter.client
     assert painter.told() == {"on": False}
-    until(lambda: session.snapshot.health.time > 0.05)
+    reached(session, 0.05)
     came, take = [], page.brushes.take
     page.brushes.take = lambda key, move: (take(key, move), came.append(move))
     painter.move([200, 150])  # before painting is on
@@ -117,7 +117,7 @@ def test_while_it_is_painted_the_object_is_at_rest_and_then_it_goes_on(page, joi
     assert painter.told() == {"on": True, "radius": 45.0}
     client.set(painting.on, False)
     assert not painter.told()["on"]
-    until(lambda: session.snapshot.health.time > 0.05)
+    reached(session, 0.05)
     assert page.roles is None
     session.pause()
     client.set(painting.on, True)
@@ -245,7 +245,7 @@ def test_parts_are_applied_with_the_size_that_the_object_has(page, painter, plac
     assert not still[scene.simulated.numpy()].any()
     assert len(scene.simulated) == (~still).sum()
     assert scene.frame.metres_per_unit == pytest.approx(metres)
-    until(lambda: session.snapshot.health.time > 0.05)  # it goes on
+    reached(session, 0.05)  # it goes on
     assert page.roles is None
     assert not painting.on.value
     session.undo()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from shared import value_error
 
 from gaussian_swaying.geometry.rotations import rotation_to_quat
 from gaussian_swaying.simulation.draw import draw_wind
@@ -136,5 +137,5 @@ def test_a_film_ends_at_its_greatest_length(monkeypatch):
 
 
 def test_a_film_without_pictures_is_refused():
-    with pytest.raises(ValueError, match="Nothing was recorded"):
+    with value_error("Nothing was recorded"):
         FilmStrip().finish()

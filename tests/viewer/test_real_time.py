@@ -1,6 +1,7 @@
 """The grid on which the live page keeps up with real time, with made-up costs and with a flag."""
 
 import pytest
+from shared import value_error
 from small_scenes import run_cost
 
 from gaussian_swaying.simulation.simulation import Simulation
@@ -75,7 +76,7 @@ def test_a_grid_that_cannot_be_configured_is_an_error():
     def measure(dx):
         raise ValueError("a pin holds nothing")
 
-    with pytest.raises(ValueError, match="a pin holds nothing"):
+    with value_error("a pin holds nothing"):
         finest_in_real_time(measure, 2.0, CONFIGURED, COARSEST)
 
 

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 import yaml
-from browsers import until
+from browsers import reached, until
 
 from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.rendering.thinning import DETAIL
@@ -25,7 +25,7 @@ def _position(session):
 
 def test_it_goes_on_pauses_and_steps(session):
     session.start()
-    until(lambda: session.snapshot.health.time > 0.1)
+    reached(session, 0.1)
     pause(session)
     now = session.snapshot
     in_turn(session)
@@ -78,7 +78,7 @@ def test_it_does_the_same_as_a_loop_over_frames(parser, settings, session, monke
 def test_what_changes_in_motion(session, values, found):
     """The simulation stays the same object, and the state goes on."""
     session.start()
-    until(lambda: session.snapshot.health.time > 0.05)
+    reached(session, 0.05)
     simulation, time_before = session.simulation, session.snapshot.health.time
     session.change(values)
     until(lambda: found(session.simulation))
@@ -89,13 +89,13 @@ def test_what_changes_in_motion(session, values, found):
 
 def test_another_grid_starts_anew_and_the_same_grid_goes_on(session):
     session.start()
-    until(lambda: session.snapshot.health.time > 0.1)
+    reached(session, 0.1)
     session.pause()
     session.change({"solver.dx": 0.15})
     until(lambda: session.snapshot.simulation.solver.dx == 0.15)
     assert session.snapshot.health.time == 0.0
     session.pause(False)
-    until(lambda: session.snapshot.health.time > 0.1)
+    reached(session, 0.1)
     before, simulation = session.snapshot.health.time, session.simulation
     session.change({"solver.boundaries": []})  # let go
     until(lambda: session.snapshot.simulation is not simulation)
@@ -135,7 +135,7 @@ def test_what_diverges_is_told_and_reset_heals_it(session):
     assert session.snapshot.number == number
     session.change({"wind.flow": [1.0, 0.0, 0.0]})
     session.reset()
-    until(lambda: session.snapshot.health.time > 0.1)
+    reached(session, 0.1)
     assert not session.broken
     assert session.problem is None
 
@@ -151,7 +151,7 @@ def test_reset_goes_back_to_rest_and_keeps_what_was_changed(session):
     until(lambda: session.snapshot.health.time == 0)
     assert torch.equal(_position(session), rest)
     session.pause(False)
-    until(lambda: session.snapshot.health.time > 0.05)
+    reached(session, 0.05)
     assert float(session.simulation.scene.points.youngs_modulus.amax()) == pytest.approx(2e4)
     assert session.simulation.solver.damping == 3.0
 
@@ -223,7 +223,7 @@ def test_undo_heals_what_diverged_and_forgets_what_was_refused(session):
     session.undo()
     until(lambda: not session.broken and session.snapshot.health.time > 0.05)
     assert session.problem is None
-    assert float(session.simulation.wind.flows.norm()) < 100
+    assert session.simulation.wind.flows.norm() < 100
 
 
 def test_material_of_parts_is_that_of_a_run(parser, settings, tmp_path):

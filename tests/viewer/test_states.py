@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from browsers import until
+from browsers import reached
+from shared import EYE, double
 
 from gaussian_swaying.gaussians.parts import ROLES
 from gaussian_swaying.gaussians.ply import write_ply
@@ -40,7 +41,7 @@ def nodal(raw):
 
 def test_a_state_is_the_displacement_of_the_nodes(session):
     session.start()
-    until(lambda: session.snapshot.health.time > 0.1)
+    reached(session, 0.1)
     session.pause()
     snapshot = session.wait(-1, 0)
     scene, moved = snapshot.simulation.scene, snapshot.simulation.scene.follow.nodal(snapshot.state).numpy()
@@ -62,7 +63,7 @@ def test_a_state_is_the_displacement_of_the_nodes(session):
 def test_a_scene_is_a_film_without_frames(session):
     snapshot = session.snapshot
     film = film_without_frames(snapshot.simulation, snapshot.state, "scene")
-    head, rest = read(scene_message(snapshot, torch.eye(3).double()))
+    head, rest = read(scene_message(snapshot, EYE))
     moving, still = pack_splats(film, moving=True), pack_splats(film, moving=False)
     assert head["head"] == film.head
     assert (head["moving"], head["still"]) == (len(moving), len(still))
@@ -81,7 +82,7 @@ def test_the_camera_finds_the_gaussians_in_any_scene(parser, settings, tmp_path)
     snapshot = session.snapshot
     simulation = snapshot.simulation
     film = film_without_frames(simulation, snapshot.state, "scene")
-    turn = torch.tensor([[0.0, 0, -1], [0, -1, 0], [-1, 0, 0]], dtype=torch.float64)
+    turn = double([[0.0, 0, -1], [0, -1, 0], [-1, 0, 0]])
     world = film_from(simulation.scene, turn)
     seen = simulation.scene.model.means.double()[film.order] @ turn.T
     assert torch.allclose(seen @ world[:3, :3].T + world[:3, 3], torch.from_numpy(film.position).double(), atol=1e-5)
@@ -117,7 +118,7 @@ def test_a_gpu_is_read_in_turn(session, monkeypatch):
         assert drawable(snapshot)
         state_message(snapshot, False)
         look_message(snapshot.simulation)
-        scene_message(snapshot, torch.eye(3).double())
+        scene_message(snapshot, EYE)
         assert taken == [snapshot.simulation.turn] * turns
 
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from shared import unit
+from shared import EYE, double, normalized, rand, randn, seeded, unit
 from torch.testing import assert_close
 
 from gaussian_swaying import AeroForce, WindField, WindForce, aero_force
@@ -25,13 +25,13 @@ POINTS = 40
 
 def random_patches(spread, each=30, seed=0):
     """Patches of random areas whose normals spread around that of their point; one point has none."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     main = unit(POINTS, 3, generator=generator)
     point = torch.randint(1, POINTS, (each * POINTS,), generator=generator)
-    noise = spread * torch.randn(len(point), 3, generator=generator, dtype=torch.float64)
-    normal = torch.nn.functional.normalize(main[point] + noise, dim=-1)
+    noise = spread * randn(len(point), 3, generator=generator)
+    normal = normalized(main[point] + noise)
     normal = normal * torch.where(torch.rand(len(point), generator=generator) < 0.5, -1.0, 1.0)[:, None]
-    area = 1e-4 * torch.rand(len(point), generator=generator, dtype=torch.float64)
+    area = 1e-4 * rand(len(point), generator=generator)
     return normal, area, point
 
 
@@ -54,16 +54,16 @@ def off(found, expected):
 
 
 def winds(count=60):
-    generator = torch.Generator().manual_seed(1)
+    generator = seeded(1)
     return 5 * unit(count, 3, generator=generator)
 
 
 def turned(stretch=0.0):
     """Rotations of the points, with some stretch."""
-    generator = torch.Generator().manual_seed(2)
-    quats = torch.randn(POINTS, 4, generator=generator, dtype=torch.float64)
-    strain = stretch * torch.randn(POINTS, 3, 3, generator=generator, dtype=torch.float64)
-    return quat_to_rotation(quats) @ (torch.eye(3, dtype=torch.float64) + 0.5 * (strain + strain.mT))
+    generator = seeded(2)
+    quats = randn(POINTS, 4, generator=generator)
+    strain = stretch * randn(POINTS, 3, 3, generator=generator)
+    return quat_to_rotation(quats) @ (EYE + 0.5 * (strain + strain.mT))
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -72,12 +72,12 @@ def test_force_is_the_sum_over_the_patches(law, spread):
     """Of a flat, a noisy and an arbitrary group, in any direction, whatever its rotation: within 1 %."""
     normal, area, point = random_patches(spread)
     sums, F = PatchSums(Patches(normal, area, point, POINTS)), turned()
-    velocity = torch.zeros(POINTS, 3, dtype=torch.float64)
+    velocity = torch.zeros(POINTS, 3).double()
     for wind in winds():
         expected = each_patch(wind, velocity, F, normal, area, point, **LAWS[law])
         found, now = grouped_force(wind, velocity, F, sums, **LAWS[law])
         assert off(found, expected) < 0.01
-        assert (found - expected).sum(0).norm() < 0.01 * float(expected.norm(dim=-1).sum())
+        assert (found - expected).sum(0).norm() < 0.01 * expected.norm(dim=-1).sum()
         assert not found[0].any()
         assert_close(now.sum(), area.sum())
         aero = AeroForce(C_D=0.5, drag_step="semi_implicit")
@@ -90,7 +90,7 @@ def test_force_is_the_sum_over_the_patches(law, spread):
 )
 def test_strain_costs_less_than_itself(law):
     """The mean growth of area stands for that of each patch: exact for one direction, else no worse than the strain."""
-    velocity = torch.zeros(POINTS, 3, dtype=torch.float64)
+    velocity = torch.zeros(POINTS, 3).double()
     for spread, bound in ((0.0, 1e-9), (0.1, 0.01), (3.0, 0.05)):
         normal, area, point = random_patches(spread)
         sums, F = PatchSums(Patches(normal, area, point, POINTS)), turned(0.05)
@@ -119,7 +119,7 @@ def test_a_small_lift_needs_few_directions(lift):
     patches, aero = Patches(normal, area, point, POINTS), AeroForce(C_L=lift, law="projected")
     few, all_of_them = WindForce(aero, WindField([1.0, 0.0, 0.0]), patches).sums, PatchSums(patches)
     assert len(few.vector) < 0.6 * len(all_of_them.vector)
-    velocity, F = torch.zeros(POINTS, 3, dtype=torch.float64), turned()
+    velocity, F = torch.zeros(POINTS, 3).double(), turned()
     for wind in winds():
         law = {"drag": 0.5, "friction": 0.4, "lift": lift, "law": "projected"}
         expected = each_patch(wind, velocity, F, normal, area, point, **law)
@@ -131,7 +131,7 @@ def test_a_small_lift_needs_few_directions(lift):
 def test_gradients(law):
     normal, area, point = random_patches(0.3, each=3)
     sums = PatchSums(Patches(normal, area, point, POINTS))
-    wind = torch.tensor([3.0, -1.0, 0.4], dtype=torch.float64, requires_grad=True)
+    wind = double([3.0, -1.0, 0.4]).requires_grad_()
     velocity = torch.zeros(POINTS, 3, dtype=torch.float64, requires_grad=True)
     F = turned(0.05).requires_grad_()
 
@@ -146,7 +146,7 @@ def test_directions_are_joined_up_to_a_number():
     sums = PatchSums(Patches(normal, area, point, POINTS))
     assert int(sums.point.bincount().max()) <= MOST
     assert (sums.point.diff() >= 0).all()
-    total = torch.zeros(POINTS, dtype=torch.float64).index_add(0, sums.point, sums.vector.norm(dim=-1))
+    total = torch.zeros(POINTS).double().index_add(0, sums.point, sums.vector.norm(dim=-1))
     assert_close(total, sums.area)
     assert not PatchSums(Patches(normal, area, point, POINTS)).single
     nothing = PatchSums(Patches(normal[:0], area[:0], point[:0], 3))

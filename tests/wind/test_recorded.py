@@ -6,7 +6,7 @@ import struct
 import numpy as np
 import pytest
 import torch
-from shared import double
+from shared import EYE, double, value_error
 from torch.testing import assert_close
 
 from gaussian_swaying import SimFrame, WindField
@@ -58,7 +58,7 @@ def test_a_recorded_wind_repeats(tmp_path):
 
 
 def test_places_of_the_file_are_in_metres_and_its_origin_in_scene_units(tmp_path):
-    frame = SimFrame(double([1.0, 0.0, 0.0]), torch.eye(3, dtype=torch.float64), 2.0)
+    frame = SimFrame(double([1.0, 0.0, 0.0]), EYE, 2.0)
     moved = RecordedWind(_npz(tmp_path / "w.npz"), origin=[2.0, 0.5, 0.0]).in_frame(frame)
     moment = Moment(double(0.0), double([0.0] * 3), double([0.0] * 3))
     found = moved(torch.zeros(3), double([[2.5, 1.2, 0.4]]), moment)
@@ -87,7 +87,7 @@ def test_places_of_the_file_are_in_metres_and_its_origin_in_scene_units(tmp_path
     ],
 )
 def test_a_grid_that_does_not_fit_is_refused(tmp_path, changes, words):
-    with pytest.raises(ValueError, match=words):
+    with value_error(words):
         read_grid(_npz(tmp_path / "w.npz", **changes))
 
 
@@ -136,7 +136,7 @@ def test_netcdf(tmp_path, engine, monkeypatch):
     found = read_grid(write(tmp_path / "w.nc", "m"))
     np.testing.assert_allclose(found.velocity, velocity, rtol=1e-6)
     np.testing.assert_allclose(found.times, AXES["time"])
-    with pytest.raises(ValueError, match=r"`x` in .* is in .km., not in m"):
+    with value_error(r"`x` in .* is in .km., not in m"):
         read_grid(write(tmp_path / "km.nc", "km"))
 
 
@@ -144,7 +144,7 @@ def test_netcdf(tmp_path, engine, monkeypatch):
 def test_without_netcdf4_a_file_that_scipy_cannot_read_names_the_extra(tmp_path, monkeypatch, content):
     monkeypatch.setitem(__import__("sys").modules, "netCDF4", None)
     (tmp_path / "w.nc").write_bytes(content)
-    with pytest.raises(ValueError, match=r"install gaussian-swaying\[netcdf\]"):
+    with value_error(r"install gaussian-swaying\[netcdf\]"):
         read_grid(tmp_path / "w.nc")
 
 
@@ -219,7 +219,7 @@ def test_headers_of_turbsim(tmp_path):
     for name, values in BAD_FIELDS.items():
         for value in values:
             write(**{name: value})
-            with pytest.raises(ValueError, match="is damaged"):
+            with value_error("is damaged"):
                 read_bts(path)
 
 
@@ -235,9 +235,9 @@ def test_planes_of_turbsim_pass_one_after_the_other(tmp_path):
 
 def test_turbsim_checks_its_wind(tmp_path):
     path, _ = _bts(tmp_path / "w.bts")
-    with pytest.raises(ValueError, match=r"is 8 m/s, but `wind.flow` has 6 m/s: set it to 8 m/s"):
+    with value_error(r"is 8 m/s, but `wind.flow` has 6 m/s: set it to 8 m/s"):
         WindField([6.0, 0.0, 0.0], effects=[FrozenWind(path)])
-    with pytest.raises(ValueError, match="not a full-field"):
+    with value_error("not a full-field"):
         read_bts(_bts(tmp_path / "bad.bts", kind=3)[0])
 
 
@@ -272,5 +272,5 @@ BAD_LINES = {
 
 def test_an_anemometer_that_does_not_fit_is_refused(tmp_path):
     for text, words in BAD_LINES.items():
-        with pytest.raises(ValueError, match=words):
+        with value_error(words):
             WindField(schedule=_csv(tmp_path / "a.csv", text))

@@ -10,9 +10,9 @@ from itertools import pairwise
 
 import pytest
 import torch
-from shared import double, solid
+from shared import ZERO, double, peak, solid, up_to
 
-from gaussian_swaying import AeroForce, Box, MPMSolver, PinnedRegion, WindField, WindForce
+from gaussian_swaying import AeroForce, MPMSolver, PinnedRegion, WindField, WindForce
 from gaussian_swaying.wind.turbulence import Turbulence
 
 DOUBLE = torch.float64
@@ -21,13 +21,13 @@ EVERY = 8  # substeps between samples
 
 
 def _tree():
-    axis = 0.1 * (torch.arange(4, dtype=DOUBLE) + 0.5)
-    place = torch.cartesian_prod(axis, axis, 0.1 * (torch.arange(12, dtype=DOUBLE) + 0.5))
+    axis = 0.1 * (torch.arange(4).double() + 0.5)
+    place = torch.cartesian_prod(axis, axis, 0.1 * (torch.arange(12).double() + 0.5))
     crown = place[:, 2] > 0.9
     density = torch.where(crown, 800.0, 300.0)
     points = solid(place, 1e-3, density, 4e5)
-    foot = PinnedRegion(Box([None, None, None], [None, None, 0.15]), kind="nodes")
-    solver = MPMSolver(dx=0.2, gravity=(0, 0, 0), damping=DAMPING, boundaries=[foot], transfer="torch")
+    foot = PinnedRegion(up_to(z=0.15), kind="nodes")
+    solver = MPMSolver(0.2, gravity=ZERO, damping=DAMPING, boundaries=[foot], transfer="torch")
     area = torch.where(crown, AREA / int(crown.sum()), 0.0).to(DOUBLE)
     normal = double([1.0, 0.0, 0.0]).expand_as(place)
     return solver, solver.init_state(points), crown, normal, area
@@ -62,14 +62,14 @@ def test_the_response_spectrum_is_that_of_linear_theory():
     # the frequency above is the damped one; the shift, 1 - zeta^2 / 2, is 0.1 %
     rate = 0.5 * DAMPING + 0.5 * AIR * DRAG * AREA * SPEED / mass
     assert rate / omega < 0.08
-    peaks = torch.stack([swing[a:b].abs().max() for a, b in pairwise(rising[:7].tolist())])
+    peaks = torch.stack([peak(swing[a:b]) for a, b in pairwise(rising[:7].tolist())])
     decay = float((peaks[0] / peaks[-1]).log()) / (5 / frequency)
     assert decay == pytest.approx(rate, rel=0.1)
 
     gusts = WindField([SPEED, 0.0, 0.0], effects=[Turbulence(0.05, 1.5, cells=[256, 32, 32], spacing=0.25, seed=3)])
     found, step, _, _ = _sway(gusts, 40.0)
     place = _tree()[1].position[crown]
-    times = step * torch.arange(len(found), dtype=DOUBLE)
+    times = step * torch.arange(len(found)).double()
     wind = torch.stack([gusts.at(t, place)[:, 0].mean() for t in times]) - SPEED
     # the oscillator, exact for a force that is linear between samples of a twentieth of a period or less
     force = AIR * DRAG * AREA * SPEED * wind + 0.5 * AIR * DRAG * AREA * SPEED**2

@@ -8,7 +8,7 @@ import math
 
 import pytest
 import torch
-from shared import double
+from shared import EYE, double, near, peak, rand, randn, seeded, value_error
 from torch.testing import assert_close
 
 from gaussian_swaying.kernels.derive import Memory, on_tensors
@@ -127,7 +127,7 @@ def test_correlation_and_integral_length_are_von_karmans(measured):
     correlation = (torch.fft.ifft(measured[1]).real * CELLS[0] * step)[: 4 * 6 + 1]
     x = H * torch.arange(1, 25, dtype=torch.float64) / (VON_KARMAN * L)
     closed = 2 ** (2 / 3) / math.gamma(1 / 3) * x ** (1 / 3) * _bessel_k(1 / 3, x)
-    assert_close(correlation[1:], closed, rtol=0, atol=0.03)
+    near(correlation[1:], closed, 0.03)
     correlation[0] = 1.0
     length = float(torch.trapezoid(correlation, dx=H))
     assert length == pytest.approx(L, rel=0.05)
@@ -203,9 +203,9 @@ def test_interpolation_takes_the_smallest_waves():
     (k1, k2, k3), share = _waves()
     kept = [(2 + torch.cos(k * H)) / 3 for k in (k1, k2, k3)]
     target = float((share * kept[0][:, None, None] * kept[1][:, None] * kept[2]).sum())
-    assert target < 0.9 * float(share.sum())
-    draw = torch.Generator().manual_seed(1)
-    place = torch.rand(100_000, 3, dtype=torch.float64, generator=draw) * torch.tensor(CELLS)
+    assert target < 0.9 * share.sum()
+    draw = seeded(1)
+    place = rand(100_000, 3, generator=draw) * torch.tensor(CELLS)
     found = 0.0
     for seed in range(SEEDS):
         box = turbulence_box(CELLS, [H] * 3, L, seed=seed)
@@ -214,7 +214,7 @@ def test_interpolation_takes_the_smallest_waves():
 
 
 def test_look_ups_are_exact_for_a_linear_field():
-    table = torch.cartesian_prod(*[torch.arange(n, dtype=torch.float64) for n in (4, 5, 6)]).reshape(4, 5, 6, 3)
+    table = torch.cartesian_prod(*[torch.arange(n).double() for n in (4, 5, 6)]).reshape(4, 5, 6, 3)
     place = double([[0.3, 3.2, 4.9], [2.99, 0.0, 5.0], [-1.0, 7.0, 2.5]])
     expected = place.clone()
     expected[2] = torch.tensor([0.0, 4.0, 2.5])
@@ -265,8 +265,8 @@ def test_a_seed_is_a_turbulence(device):
         turbulence_box((32, 16, 16), [0.25] * 3, L, gamma=2.0, seed=seed, device=where)
         for seed, where in ((5, "cpu"), (5, device), (6, "cpu"))
     )
-    assert_close(same.cpu(), one, rtol=0, atol=0 if one.device == same.device else 2e-5)
-    assert (one - other).abs().max() > 0.5
+    near(same.cpu(), one, 0 if one.device == same.device else 2e-5)
+    assert peak(one - other) > 0.5
 
 
 @pytest.mark.parametrize(
@@ -281,7 +281,7 @@ def test_a_seed_is_a_turbulence(device):
     ],
 )
 def test_impossible_boxes_are_refused(changes, message):
-    with pytest.raises(ValueError, match=message):
+    with value_error(message):
         _gusts(**changes)
 
 
@@ -293,11 +293,11 @@ def test_turbulence_is_carried_by_the_mean_wind():
     """Taylor: what is at x now is at x + U t later, whatever the modulations; the size follows from the speed."""
     flow = double([3.0, -4.0, 0.5])
     wind = WindField(flow.tolist(), effects=[_gusts()])
-    place = torch.rand(50, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    place = rand(50, 3, generator=seeded(0))
     now, later = (double(t) for t in (0.3, 7.9))
     first = wind.at(now, place)
-    assert_close(wind.at(later, place + (later - now) * flow), first, rtol=0, atol=1e-10)
-    assert (wind.at(later, place) - first).abs().max() > 0.5
+    near(wind.at(later, place + (later - now) * flow), first, 1e-10)
+    assert peak(wind.at(later, place) - first) > 0.5
     moment = Moment(now, flow, wind.carried(now))
     still = wind.effects[0](torch.zeros(3), place, moment)
     twice = wind.effects[0](torch.zeros(3), place, Moment(now, 2 * flow, wind.carried(now)))
@@ -310,7 +310,7 @@ def test_the_box_comes_back_at_another_place():
     flow = torch.tensor([1.0, 2.0, 0.0])
     tilted, straight = (box_axes(flow, sides, tilted) for tilted in (True, False))
     for axes in (tilted, straight):
-        assert_close(axes @ axes.T, torch.eye(3, dtype=torch.float64))
+        assert_close(axes @ axes.T, EYE)
         assert float(torch.linalg.det(axes)) == pytest.approx(1.0)
     direction = flow.double() / flow.norm()
     assert_close(straight @ direction, double([1.0, 0.0, 0.0]))
@@ -328,9 +328,9 @@ def test_air_is_carried_by_a_changing_flow(interpolation):
     fine = torch.arange(0, 6, 1e-3, dtype=torch.float64)
     flows = wind.mean_flow(fine + 5e-4)
     sums = torch.cat([torch.zeros(1, 3), flows.cumsum(0) * 1e-3])
-    assert_close(wind.carried(fine), sums[:-1], rtol=0, atol=1e-9)
+    near(wind.carried(fine), sums[:-1], 1e-9)
     one = double(2.5)
-    assert_close(wind.carried(one), sums[2500], rtol=0, atol=1e-9)
+    near(wind.carried(one), sums[2500], 1e-9)
     assert_close(WindField([1.0, 2.0, 3.0]).carried(one), 2.5 * double([1.0, 2.0, 3.0]))
 
 
@@ -339,11 +339,11 @@ def test_a_field_that_does_not_repeat_goes_on_outside():
     table[:, 0, :, 0], table[:, 1, :, 0] = 1.0, 5.0
     field = CarriedField(table, [1.0, 0.5, 0.5], wraps=(True, False, False))
     field = field.along(torch.tensor([2.0, 0.0, 0.0]))
-    still = torch.zeros(3, dtype=torch.float64)
+    still = torch.zeros(3).double()
     place = double([[0.0, -3.0, 0.0], [100.3, 0.25, 9.0], [0.0, 3.0, 0.0]])
     found = field(torch.zeros(3), place, Moment(still[0], still, still))
     assert_close(found[:, 0], double([1.0, 3.0, 5.0]))
-    with pytest.raises(ValueError, match="Expected `table` of shape"):
+    with value_error("Expected `table` of shape"):
         CarriedField(torch.zeros(4, 2, 2), [1.0] * 3)
 
 
@@ -352,7 +352,7 @@ SECONDS, RECORDS = 400.0, 6
 
 def record(wind, places, step=0.2, seconds=SECONDS):
     """Wind at places (K, 3), shape (T, K, 3); the field is carried, so a later time is a place upstream."""
-    times = torch.arange(round(seconds / step), dtype=torch.float64) * step
+    times = torch.arange(round(seconds / step)).double() * step
     where = torch.as_tensor(places, dtype=torch.float64) - times[:, None, None] * wind.flows[0].double()
     return wind.at(times[0], where.reshape(-1, 3)).double().reshape(len(times), -1, 3)
 
@@ -391,8 +391,8 @@ def test_direction_and_speed_may_be_given():
     wind = look("storm", (3.0, 4.0, 0.0), speed=5.0)
     assert wind.flows[0].tolist() == pytest.approx([3.0, 4.0, 0.0])
     assert not wind.uniform
-    places = torch.zeros(1, 3, dtype=torch.float64)
-    first, other = (look("storm", seed=seed).at(torch.zeros((), dtype=torch.float64), places) for seed in (0, 1))
+    places = torch.zeros(1, 3).double()
+    first, other = (look("storm", seed=seed).at(double(0.0), places) for seed in (0, 1))
     assert not torch.equal(first, other)
     assert look("breeze", speed=0.0).flows[0].tolist() == [0.0, 0.0, 0.0]
 
@@ -410,7 +410,7 @@ def test_direction_and_speed_may_be_given():
     ],
 )
 def test_bad_input_is_refused(given, words):
-    with pytest.raises(ValueError, match=words):
+    with value_error(words):
         look(**{"name": "breeze"} | given)
 
 
@@ -420,18 +420,18 @@ def test_a_simulation_takes_a_look_by_its_name(make_simulation):
     assert wind.flows[0].tolist() == pytest.approx([LOOKS["gusts"].speed, 0.0, 0.0])
     assert [type(effect) for effect in wind.effects] == [Turbulence]
     assert wind.effects[0].intensity == LOOKS["gusts"].intensity
-    with pytest.raises(ValueError, match="one of breeze, gusts, storm"):
+    with value_error("one of breeze, gusts, storm"):
         make_simulation(wind="gales")
 
 
 def test_a_start_is_a_later_time():
     """The air has come the start's way: U t."""
-    flow, places = [6.0, 2.0, 0.0], torch.randn(20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    flow, places = [6.0, 2.0, 0.0], randn(20, 3, generator=seeded(0))
     plain = WindField(flow, effects=[Turbulence(0.3, 1.5)])
     later = WindField(flow, effects=[Turbulence(0.3, 1.5, start=[7.0 * c for c in flow])])
     for time in (0.0, 1.3):
         found, expected = (wind.at(double(t), places) for wind, t in ((later, time), (plain, time + 7.0)))
-        assert_close(found, expected, rtol=0, atol=1e-4)  # places of float32 in a box of some 100 cells
+        near(found, expected, 1e-4)  # places of float32 in a box of some 100 cells
     assert not torch.allclose(found, plain.at(double(1.3), places), atol=0.1)
 
 

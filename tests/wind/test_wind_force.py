@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from shared import double, solid, unit
+from shared import EYE, double, in_both, near, peak, rand, seeded, solid, unit, value_error
 from torch.testing import assert_close
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -33,7 +33,7 @@ ZERO = double(0.0)
 
 def _setting(wind=GUSTS, batch=(), formulation="total", transfer="torch", like=ZERO, groups=False, **aero):
     """A solver, a state that has moved a little, and the load; two patches on each particle with ``groups``."""
-    draw = torch.Generator().manual_seed(0)
+    draw = seeded(0)
     position, velocity, area = (
         make(*batch, 20, n, dtype=torch.float64, generator=draw).to(like)
         for make, n in ((torch.rand, 3), (torch.randn, 3), (torch.rand, 1))
@@ -45,7 +45,7 @@ def _setting(wind=GUSTS, batch=(), formulation="total", transfer="torch", like=Z
         patches = (Patches(torch.cat([normal, normal.roll(1, 0)]), area.repeat(2), owner, 20),)
     wind = wind.to(like.device) if isinstance(wind, torch.nn.Module) else wind
     load = WindForce(AeroForce(**aero).to(like.device), wind, *patches)
-    solver, plain = (MPMSolver(dx=0.1, formulation=formulation, transfer=kind) for kind in (transfer, "torch"))
+    solver, plain = (MPMSolver(0.1, formulation, transfer=kind) for kind in (transfer, "torch"))
     points = solid(0.06 + 0.2 * position, 1e-4, 50.0)
     solver.init_state(points, velocity)
     return solver, plain.rollout(plain.init_state(points, velocity), DT, 2), load
@@ -85,17 +85,17 @@ def test_force_is_that_on_the_deformed_patches(drag_step, cap):
 def test_gradients_through_a_capped_area_are_finite():
     """Also where the patch stands exactly at the cap; above it only the direction of the normal is left in F."""
     _, state, load = _setting(max_area_ratio=1.0)
-    F = torch.eye(3, dtype=torch.float64).repeat(20, 1, 1)
+    F = EYE.repeat(20, 1, 1)
     F[:10, 0, 1] = 3e4
     force, _ = load.force(state.replace(F_total=F.requires_grad_()), double([5.0, 0.0, 1.0]))
     (slope,) = torch.autograd.grad(force.square().sum(), F)
     assert torch.isfinite(slope).all()
-    assert slope.abs().amax() > 0
+    assert peak(slope) > 0
     # growth of F as a whole turns no normal, so the force does not see it
-    assert (slope * F.detach())[:10].sum((-1, -2)).abs().max() < 1e-9 * 3e4 * float(slope[:10].abs().max())
+    assert peak((slope * F.detach())[:10].sum((-1, -2))) < 1e-9 * 3e4 * peak(slope[:10])
 
 
-@pytest.mark.parametrize("formulation", ["total", "updated"])
+@in_both
 def test_a_batch_is_each_scene_by_itself(formulation):
     solver, state, load = _setting([GUSTS, RISING], (2,), formulation)
     force, _ = load(state)
@@ -111,7 +111,7 @@ def test_gradients_reach_the_patches_and_the_coefficients():
     load.aero.C_D.requires_grad_()
     end = solver.rollout(state, DT, 3, load).position.square().sum()
     for found in torch.autograd.grad(end, [load.area, load.aero.C_D]):
-        assert found.abs().max() > 0
+        assert peak(found) > 0
 
 
 @pytest.mark.parametrize("name", ["area", "normal", "C_D", "flows"])
@@ -137,7 +137,7 @@ def test_shapes_are_checked():
         (r"one `wind` for each of the \(2,\) scenes, but got 3", [GUSTS] * 3, up.expand(2, 4, 3), one(2, 4)),
         (r"one `wind` for each of the \(3,\) scenes, but got 1", WindField.together([GUSTS]), one(3, 5, 3), one(3, 5)),
     ):
-        with pytest.raises(ValueError, match=words):
+        with value_error(words):
             WindForce(AeroForce(), wind, *patches)
 
 
@@ -158,8 +158,8 @@ def _blown(winds, turn, shift, delay):
     turns = torch.stack([_turn(0.0), turn])
     places = torch.nn.Module()
     vars(places).update(turn=turns, shift=double([[0.0] * 3, shift]), delay=double([0.0, delay]))
-    load = WindForce(AeroForce(), winds, torch.eye(3, dtype=torch.float64)[2:].expand(5, 3), torch.ones(5), places)
-    return load, torch.rand(2, 5, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    load = WindForce(AeroForce(), winds, EYE[2:].expand(5, 3), torch.ones(5), places)
+    return load, rand(2, 5, 3, generator=seeded(1))
 
 
 def test_copies_feel_one_wind_turned_and_later():
@@ -170,8 +170,8 @@ def test_copies_feel_one_wind_turned_and_later():
     assert found.shape == (4, 2, 1, 3)
     assert torch.equal(found[:, 0, 0], wind(times))
     later = changed(wind, seed=6)(times - 0.7)
-    assert_close(found[:, 1, 0], later @ _turn(90.0), rtol=0, atol=1e-15)
-    assert float(later[:, 0].abs().max()) < 1e-12 < 0.9 < float(found[:, 1, 0, 0].min())
+    near(found[:, 1, 0], later @ _turn(90.0), 1e-15)
+    assert peak(later[:, 0]) < 1e-12 < 0.9 < found[:, 1, 0, 0].min()
 
 
 @pytest.mark.parametrize("wind", [Whirl(), WindField([4.0, 1.0, 0.0], effects=[PowerProfile(height=2.0)])])
@@ -187,7 +187,7 @@ def test_copies_feel_the_wind_at_their_places(wind):
 
 def test_a_force_in_many_winds():
     winds = [WindField([3.0 + k, 0.0, 0.0], modulations=[UniformGust(0.5)], seed=k) for k in range(3)]
-    normal, area = unit(5, 3, generator=torch.Generator().manual_seed(0)), torch.full((5,), 0.1)
+    normal, area = unit(5, 3, generator=seeded(0)), torch.full((5,), 0.1)
     batch = WindForce(AeroForce(), WindField.together(winds), normal, area)
     listed = WindForce(AeroForce(), winds, normal.expand(3, 5, 3), area.expand(3, 5))
     assert torch.equal(batch.winds(double(0.7), 1e-3, 6), listed.winds(double(0.7), 1e-3, 6))
@@ -234,16 +234,16 @@ def test_turbulence_does_not_depend_on_the_substep():
         found.append(forces.sum(0) * dt)
         kept.append(forces[:: round(4e-3 / dt)])
     for forces in kept[1:]:
-        assert_close(forces, kept[0], rtol=0, atol=1e-12)
-    assert kept[0].std(0).max() > 0.05 * float(kept[0].abs().max())  # it gusts
-    size = float(found[2].abs().max())
-    coarse, fine = (float((one - found[2]).abs().max()) / size for one in found[:2])
+        near(forces, kept[0], 1e-12)
+    assert kept[0].std(0).max() > 0.05 * peak(kept[0])  # it gusts
+    size = float(peak(found[2]))
+    coarse, fine = (float(peak(one - found[2])) / size for one in found[:2])
     assert coarse < 0.02
     assert fine < 0.4 * coarse  # a third
 
 
 def _field():
-    table = 2 * torch.randn(6, 5, 4, 3, generator=torch.Generator().manual_seed(3))
+    table = 2 * torch.randn(6, 5, 4, 3, generator=seeded(3))
     return CarriedField(
         table, [0.05, 0.07, 0.06], origin=[0.1, 0.0, 0.1], anchor=[0.1, 0.2, 0.05], wraps=(True, False, False), scale=2
     )
@@ -289,7 +289,7 @@ def _pair(device, make, formulation="total", **options):
 def _same(found, expected):
     for name in ("position", "velocity", "F_total"):
         a, b = getattr(found, name), getattr(expected, name)
-        assert_close(a, b, rtol=0, atol=TOLERANCE * float(b.abs().max()))
+        near(a, b, TOLERANCE * float(peak(b)))
     assert_close(found.work, expected.work, rtol=1e-4, atol=1e-7)
 
 
@@ -317,8 +317,8 @@ def test_the_kernels_blow_as_torch_does(kernel_device, formulation, name, option
         before, state = state, expected
     assign(load.wind, effects=torch.nn.ModuleList())
     bare = reference.rollout(before, DT, 3, load)
-    change = float((bare.velocity - expected.velocity).abs().max())
-    least = 1e-2 * float(expected.velocity.abs().max())
+    change = float(peak(bare.velocity - expected.velocity))
+    least = 1e-2 * float(peak(expected.velocity))
     assert change > least, f"without the effects the velocity differs by {change:.2g} m/s: make them stronger in _wind"
 
 
@@ -335,9 +335,9 @@ def test_a_changed_effect_is_read_again_at_the_same_address(kernel_device):
         _same(ends[-1], reference.rollout(state, DT, 5, load))
         where = where or solver.kernels.loads.buffer.data_ptr()
         assert solver.kernels.loads.buffer.data_ptr() == where
-    assert_close(ends[0].position, ends[1].position, rtol=0, atol=1e-6)
+    near(ends[0].position, ends[1].position, 1e-6)
     for one, other in ((1, 2), (2, 3)):
-        assert (ends[one].velocity - ends[other].velocity).abs().max() > 1e-3
+        assert peak(ends[one].velocity - ends[other].velocity) > 1e-3
 
 
 def _packed(load, device):
@@ -380,7 +380,7 @@ class _NoReading(TorchDispatchMode):
 
 def test_the_host_reads_nothing_of_a_wind():
     """So all of it can be recorded, and the needs of the next frame of a shelter can be measured in a CUDA graph."""
-    time, place = torch.tensor(0.003, dtype=torch.float64), torch.rand(20, 3)
+    time, place = double(0.003), torch.rand(20, 3)
     for wind in map(_wind, ("all", "half", "several")):
         for interpolation in ("step", "linear"):
             wind = WindField(schedule=TURNING, interpolation=interpolation, effects=wind.effects)

@@ -111,13 +111,12 @@ def spectral_moduli(own, first, second, third, rest, least):
     m2 = third[0] / unit
     inner = (own[0] / unit, m2, m1, m2, own[1] / unit, m0, m1, m0, own[2] / unit)
     bound = largest(unit * largest_eigenvalue(inner), least)
-    bound = largest(bound, largest(first[1], first[2]))
-    bound = largest(bound, largest(second[1], second[2]))
-    bound = largest(bound, largest(third[1], third[2]))
     wave = largest(largest(own[0], own[1]), largest(own[2], rest))
-    wave = largest(wave, largest(first[1] - first[0], first[2] + first[0]))
-    wave = largest(wave, largest(second[1] - second[0], second[2] + second[0]))
-    wave = largest(wave, largest(third[1] - third[0], third[2] + third[0]))
+    pairs = (first, second, third)
+    for k in tl.static_range(3):
+        mixed, twist, flip = pairs[k]
+        bound = largest(bound, largest(twist, flip))
+        wave = largest(wave, largest(twist - mixed, flip + mixed))
     return tl.minimum(wave, bound, tl.PropagateNan.ALL), bound
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 from gaussian_swaying._checks import check_positive
-from gaussian_swaying.geometry.linalg_triton import clamp, dot3, where3
+from gaussian_swaying.geometry.linalg_triton import add3, clamp, dot3, scale3, where3
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.laws.elastic import hencky_energy
 from gaussian_swaying.mpm.laws.law import LOG_FLOOR, LOG_LIMIT, DeviceLaw, PlasticLaw, log
@@ -32,7 +32,7 @@ def split_strain(e0, e1, e2):
     some = squared > _NO_SHEAR
     norm = tl.where(some, tl.sqrt(tl.where(some, squared, 1.0)), 0.0)
     scale = 1.0 / tl.where(some, norm, 1.0)
-    return trace, d, norm, (d[0] * scale, d[1] * scale, d[2] * scale)
+    return trace, d, norm, scale3(scale, d)
 
 
 @triton.jit
@@ -49,11 +49,8 @@ def _stretch_of_log(x):
 def _drawn_back(trace, d, direction, flow):
     """Stretches after a flow along the deviator."""
     mean = trace / 3
-    return (
-        _stretch_of_log(d[0] - flow * direction[0] + mean),
-        _stretch_of_log(d[1] - flow * direction[1] + mean),
-        _stretch_of_log(d[2] - flow * direction[2] + mean),
-    )
+    d = add3(d, -flow, direction)
+    return _stretch_of_log(d[0] + mean), _stretch_of_log(d[1] + mean), _stretch_of_log(d[2] + mean)
 
 
 @triton.jit
@@ -213,7 +210,7 @@ def drucker_prager(a, mu, lam, internal, p, dt):
     grown = tl.exp(third)
     flowed = _drawn_back(trace, d, direction, tl.maximum(excess, 0.0))
     # at rest, the tip of the cone, what is unchanged passes gradients
-    new = where3(excess <= 0, (a[0] * grown, a[1] * grown, a[2] * grown), flowed)
+    new = where3(excess <= 0, scale3(grown, a), flowed)
     one = a[0] * 0 + 1
     new = where3(trace > 0, (one, one, one), new)
     change = l0 + l1 + l2 - log(new[0]) - log(new[1]) - log(new[2])

@@ -7,7 +7,7 @@ import re
 import pytest
 import torch
 import yaml
-from shared import refused
+from shared import double, near, rand, refused, seeded, value_error
 from small_scenes import plain_cloud
 
 from gaussian_swaying._fixed import changed
@@ -212,7 +212,7 @@ def _one(condition, tmp_path, **more):
 
 def _bar(per_side=(9, 7, 15), spacing=0.06):
     """A bar of particles, (N, 3), its longest side along z, far from the origin."""
-    axes = [torch.arange(n, dtype=torch.float64) * spacing for n in per_side]
+    axes = [torch.arange(n).double() * spacing for n in per_side]
     return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3) + torch.tensor([3.0, -2.0, 1.0])
 
 
@@ -317,7 +317,7 @@ def test_the_base_stays_and_the_crown_gets_the_momentum_of_the_kick(tmp_path):
     height = held.scene.points.position[:, 2] + 1  # metres are the normalised space's units, from the centre
     # a particle is still if all its nodes are held: one and a half cells, and none is held above 0.78
     assert float(moved[height < 0.78 - 2 * 0.04].amax()) == 0
-    assert float(moved[height > 0.9].amin()) > 0
+    assert moved[height > 0.9].amin() > 0
 
 
 # ---- the normalised space
@@ -331,7 +331,7 @@ def test_rotations_follow_one_another():
     a, b = math.radians(45.0), math.radians(6.5)
     y = [[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]]
     z = [[math.cos(b), -math.sin(b), 0], [math.sin(b), math.cos(b), 0], [0, 0, 1]]
-    expected = torch.tensor(z, dtype=torch.float64) @ torch.tensor(y, dtype=torch.float64)
+    expected = double(z) @ double(y)
     torch.testing.assert_close(rotation_matrix([45.0, 6.5], [1, 2]), expected)
     torch.testing.assert_close(
         rotation_matrix([90.0], [0]) @ torch.tensor([0, 1.0, 0]).double(), torch.eye(3)[2].double()
@@ -344,17 +344,17 @@ def test_the_frame_is_physgaussians_preprocessing(degrees, axes):
     points, space = _bar(), Normalisation(degrees, axes, 0.6)
     frame = space.fit(points)
     expected = _normalised(points, space.rotation, 0.6)
-    torch.testing.assert_close(frame.point_to_scene(points), expected, rtol=0, atol=1e-12)
-    torch.testing.assert_close(frame.point_to_sim(expected), points, rtol=0, atol=1e-12)
+    near(frame.point_to_scene(points), expected, 1e-12)
+    near(frame.point_to_sim(expected), points, 1e-12)
     assert float((expected.amax(0) - expected.amin(0)).amax()) == pytest.approx(0.6)
 
 
 @pytest.mark.parametrize(("degrees", "axes"), ROTATIONS)
 def test_boxes_mean_the_particles_that_physgaussian_selects(degrees, axes, tmp_path):
     """Area, material, pin and turning cylinder of a scene that is not aligned with its axes."""
-    generator = torch.Generator().manual_seed(3)
+    generator = seeded(3)
     rotation = rotation_matrix(degrees, axes)
-    points = 3 * torch.rand(3000, 3, generator=generator, dtype=torch.float64) - 1.5
+    points = 3 * rand(3000, 3, generator=generator) - 1.5
     points = points.float().double()
     turned = points @ rotation.T
     area = [-0.9, 1.1, -0.6, 0.8, -1.0, 0.7]
@@ -387,7 +387,7 @@ def test_boxes_mean_the_particles_that_physgaussian_selects(degrees, axes, tmp_p
     assert handle.sum() > 10
     # positions of the simulation are those of the normalised space, turned about z
     back = scene.points.position.double() @ heading(rotation)
-    torch.testing.assert_close(back - back.mean(0), place - place.mean(0), rtol=0, atol=1e-6)
+    near(back - back.mean(0), place - place.mean(0), 1e-6)
 
 
 @pytest.mark.parametrize(("degrees", "axes"), ROTATIONS)
@@ -409,7 +409,7 @@ def test_gravity_and_the_turn_point_where_physgaussian_has_them(degrees, axes, t
     moved = simulation.scene.frame.direction_to_scene(state.velocity) @ rotation.T
     means = simulation.scene.model.means[simulation.scene.simulated].double()
     place = _normalised(means, rotation, 1.0)
-    torch.testing.assert_close(moved, _turned(place, center, normal, 1.5, 0.25), rtol=0, atol=1e-6)
+    near(moved, _turned(place, center, normal, 1.5, 0.25), 1e-6)
     assert unit == pytest.approx(float(1 / (means @ rotation.T).amax(0).sub((means @ rotation.T).amin(0)).amax()))
 
 
@@ -441,7 +441,7 @@ def test_what_holds_nothing_says_where_the_splat_is_in_its_own_axes(tmp_path):
         ({"additional_material_params": [far | {"E": 1e5, "nu": 0.3}]}, place, "regions` holds no .* lie between "),
         ({"boundary_conditions": [_pulled(**far)]}, place, "holds no particle.* lie between "),
     ):
-        with pytest.raises(ValueError, match=told) as caught:
+        with value_error(told) as caught:
             _of_bar(config | {"rotation_degree": [135.0], "rotation_axis": [0]}, tmp_path).start()
         found = re.findall(r"-?\d+\.\d+", re.split(told, str(caught.value))[1])[:6]
         corners = [*points.amin(0).tolist(), *points.amax(0).tolist()]
@@ -449,11 +449,11 @@ def test_what_holds_nothing_says_where_the_splat_is_in_its_own_axes(tmp_path):
 
 
 def test_normalisation_sets_the_scale_alone(tmp_path):
-    with pytest.raises(ValueError, match="`normalisation` sets the scale"):
+    with value_error("`normalisation` sets the scale"):
         _of_bar({}, tmp_path, "--scene.longest_side", "2")
-    with pytest.raises(ValueError, match="no extent"):
+    with value_error("no extent"):
         Normalisation().fit(torch.ones(2, 3))
-    with pytest.raises(ValueError, match=r"`normalisation.scale`"):
+    with value_error(r"`normalisation.scale`"):
         Normalisation(scale=0.0)
 
 
@@ -469,7 +469,7 @@ def test_a_moving_cuboid_travels_and_its_reset_keeps_everything_at_rest(tmp_path
     assert (after.start, after.end) == (0.4, pytest.approx(0.415))  # 15 substeps
     for still in (before, after):
         assert isinstance(still, VelocityBox)
-        assert bool(still.region.contains(torch.tensor([[1e6, 0, 0]])))
+        assert still.region.contains(torch.tensor([[1e6, 0, 0]]))
         assert still.velocity.tolist() == [0, 0, 0]
     (plain,) = _one(condition | {"reset": 0}, tmp_path)
     assert plain.travels
@@ -498,9 +498,9 @@ def test_planes_are_what_they_are_named_unless_asked(tmp_path):
     assert (stuck.kind, stuck.friction) == ("sticky", 0.0)
     (other,) = _one(plane | {"surface": "collide"}, tmp_path)
     assert other.kind == "separate"
-    with pytest.raises(ValueError, match="`surface` cut of a surface_collider is not supported"):
+    with value_error("`surface` cut of a surface_collider is not supported"):
         convert(BASE | {"boundary_conditions": [plane | {"surface": "cut"}]})
-    with pytest.raises(ValueError, match="`friction` of a sticky surface_collider to be 0"):
+    with value_error("`friction` of a sticky surface_collider to be 0"):
         convert(BASE | {"boundary_conditions": [plane | {"surface": "sticky"}]})
 
 
@@ -524,10 +524,10 @@ def test_the_front_follows_physgaussians_layers(first, last, tmp_path):
     for layer in range(50):
         half = abs(first - last) / 50 * (50 - layer)
         expected = torch.where((along - last).abs() < half, 1.5 / 50 * (layer + 1), expected)
-    assert bool(release.region.contains(points).all())
+    assert release.region.contains(points).all()
     times = release.release_time(points)
-    assert bool((times <= expected + 1e-9).all())
-    assert bool((times > expected - 1.5 / 50 - 1e-9).all())
+    assert (times <= expected + 1e-9).all()
+    assert (times > expected - 1.5 / 50 - 1e-9).all()
 
 
 def test_a_pull_becomes_a_handle(tmp_path):
@@ -544,7 +544,7 @@ def test_a_pull_becomes_a_handle(tmp_path):
 def _flow(law, stretch, E=1e5, nu=0.3):
     """Norm of the deviatoric Kirchhoff stress after the return map, and of the plastic flow in logarithmic strain."""
     mu, lam = lame_parameters(torch.tensor(E).double(), torch.tensor(nu).double())
-    trial = torch.tensor(stretch, dtype=torch.float64)
+    trial = double(stretch)
     internal = None if law.internal is None else torch.tensor(law.internal).double()
     new, _ = law.flow(trial, mu, lam, internal, 1e-4)
     logs = [s.log() - s.log().mean() for s in (trial, new)]
@@ -714,7 +714,7 @@ def test_bad_input_is_refused_by_name(change, message):
 
 
 def test_a_missing_gravity_is_refused():
-    with pytest.raises(ValueError, match="Expected `g` to be a list"):
+    with value_error("Expected `g` to be a list"):
         convert({})
 
 
@@ -737,7 +737,7 @@ def test_the_camera_stands_where_physgaussians_does():
         eye, target, _ = camera.eye(frame)
         assert eye.tolist() == pytest.approx(expected)
         seen = camera(frame, 0.0, torch.zeros(3), torch.tensor([0, 0, 1.0]), 1.0)
-        torch.testing.assert_close(seen.position, eye.float(), rtol=0, atol=1e-5)
+        near(seen.position, eye.float(), 1e-5)
         assert target.tolist() == [0.95, 1.07, 1.0]
 
 
@@ -770,10 +770,10 @@ def test_cameras_of_the_model(tmp_path):
     orbit = _parts(BASE | moving, tmp_path, cameras=str(path)).camera
     seen = orbit(0, 0.0, torch.zeros(3), torch.tensor([0, 0, 1.0]), 1.0)
     assert (seen.width, seen.height, float(seen.intrinsics[0, 0])) == (64, 36, 50.0)
-    with pytest.raises(ValueError, match="has 1 cameras, and none with the index 4"):
+    with value_error("has 1 cameras, and none with the index 4"):
         read_model_camera(path, 4)
     path.write_text(json.dumps([{"position": [0, 0, 0]}]))
-    with pytest.raises(ValueError, match="it needs position, rotation"):
+    with value_error("it needs position, rotation"):
         read_model_camera(path, 0)
 
 
@@ -796,10 +796,10 @@ def test_parts_of_the_splat_work_with_a_converted_configuration(tmp_path):
     last = list(simulation.frames(6))[-1].gaussians.means.double()
     moved = (last - cloud.means).norm(dim=-1)
     assert float(moved[label == 0].max()) == 0.0
-    assert float(moved[label == 1].max()) > 0.02
+    assert moved[label == 1].max() > 0.02
     board = label == 2
-    assert float(moved[board].min()) > 0.01
-    torch.testing.assert_close(torch.pdist(last[board]), torch.pdist(cloud.means[board].double()), rtol=0, atol=1e-5)
+    assert moved[board].min() > 0.01
+    near(torch.pdist(last[board]), torch.pdist(cloud.means[board].double()), 1e-5)
 
 
 # ---- command lines

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import curve_fit
-from shared import double, solid
+from shared import ZERO, beyond, double, in_both, longest, near, peak, solid, up_to, value_error
 from torch.testing import assert_close
 
 from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedPoints, PinnedRegion
@@ -14,18 +14,16 @@ from gaussian_swaying.geometry.regions import Everything, Union
 from gaussian_swaying.mpm.colliders import HalfSpaceObstacle
 from gaussian_swaying.mpm.pins import Handle, RigidRegion
 
-from .bodies import in_both, near
-
-RIGHT = Box([0.2, None, None], [None] * 3)
+RIGHT = beyond(x=0.2)
 
 
 def bar(*boundaries, formulation="total", transfer="auto", dx=0.05, dtype=torch.float64, gravity=(0, 0, -9.8), **other):
     """A bar of 0.4 m along x, and its solver."""
     h = dx / 2
     count = [round(length / h) for length in (0.4, 0.1, 0.1)]
-    place = torch.cartesian_prod(*[(torch.arange(n, dtype=torch.float64) + 0.5) * h for n in count])
+    place = torch.cartesian_prod(*[(torch.arange(n).double() + 0.5) * h for n in count])
     points = solid(place.to(dtype), h**3, 300.0, 2e4, **other)
-    return points, MPMSolver(dx=dx, formulation=formulation, gravity=gravity, transfer=transfer, boundaries=boundaries)
+    return points, MPMSolver(dx, formulation, gravity=gravity, transfer=transfer, boundaries=boundaries)
 
 
 def advance(solver, state, seconds, frames=10):
@@ -41,7 +39,7 @@ def right(points):
 
 
 def strain(F):
-    return float((F.mT @ F - torch.eye(3, dtype=F.dtype)).abs().max())
+    return float(peak(F.mT @ F - torch.eye(3, dtype=F.dtype)))
 
 
 @pytest.mark.parametrize(
@@ -64,9 +62,9 @@ def test_a_free_part_keeps_momenta_energy_and_shape(formulation, transfer, dtype
     rounding = 1.0 if dtype == torch.float64 else 1e7
     for _ in range(3 if transfer == "torch" else 10):
         state = solver.rollout(solver.fit_grid(state, 0.1), 1e-3, 100)
-        errors.append(float((torch.pdist(state.position.double()) - distance).abs().max()))
+        errors.append(float(peak(torch.pdist(state.position.double()) - distance)))
         assert strain(state.F_total) < 1e-13 * rounding
-        assert float(torch.linalg.det(state.F_total).min()) > 0
+        assert torch.linalg.det(state.F_total).min() > 0
     assert max(errors) < (1e-13 if rounding == 1 else 1e-5)  # nor do they grow
     for name, value in solver.momenta(state).items():
         assert_close(value, momenta[name], rtol=1e-10 if rounding == 1 else 1e-4, atol=1e-10 if rounding == 1 else 1e-6)
@@ -77,7 +75,7 @@ def test_a_free_part_keeps_momenta_energy_and_shape(formulation, transfer, dtype
 @in_both
 def test_half_of_a_bar_pulls_at_the_other(formulation):
     """The rigid half keeps its shape, the soft half bends, both fly on with the momenta of both together."""
-    points, solver = bar(RigidRegion(RIGHT), formulation=formulation, gravity=(0, 0, 0))
+    points, solver = bar(RigidRegion(RIGHT), formulation=formulation, gravity=ZERO)
     own = right(points)
     velocity = torch.where(own[:, None], double([0.0, 0.0, 1.0]), 0.0)
     state = solver.rollout(solver.init_state(points, velocity, margin=4), 1e-4, 1)
@@ -87,33 +85,33 @@ def test_half_of_a_bar_pulls_at_the_other(formulation):
         assert_close(value, before[name], rtol=1e-9, atol=1e-10)
     assert strain(state.F_total[own]) < 1e-12
     assert strain(state.F_total[~own]) > 1e-3
-    assert float(state.velocity[~own, 2].mean()) > 0.2  # it is taken along
+    assert state.velocity[~own, 2].mean() > 0.2  # it is taken along
     gap = (state.position[own, 0].min() - state.position[~own, 0].max()).abs()
     assert float(gap) < 0.05  # and does not tear off
 
 
 @in_both
 def test_a_part_next_to_a_held_one_stays(formulation):
-    pin = PinnedRegion(Box([None] * 3, [0.1, None, None]), "nodes")
+    pin = PinnedRegion(up_to(x=0.1), "nodes")
     points, solver = bar(RigidRegion(Box([0.1, None, None], [0.3, None, None])), pin, formulation=formulation)
     state = advance(solver, solver.init_state(points), 0.3)
     moved = (state.position - points.position).norm(dim=-1)
-    assert float(moved[points.position[:, 0] < 0.3].max()) < 1e-7
-    assert float(moved[points.position[:, 0] > 0.3].max()) > 1e-3
+    assert moved[points.position[:, 0] < 0.3].max() < 1e-7
+    assert moved[points.position[:, 0] > 0.3].max() > 1e-3
 
 
 def test_a_pin_of_no_kind_holds_the_nodes_of_a_rigid_part():
-    points, solver = bar(PinnedRegion(Box([0.3, None, None], [None] * 3)), RigidRegion(RIGHT))
+    points, solver = bar(PinnedRegion(beyond(x=0.3)), RigidRegion(RIGHT))
     state = advance(solver, solver.init_state(points), 0.2)
     assert solver.bound.kinds == ("nodes", "nodes")
-    assert float((state.position - points.position)[right(points)].abs().max()) < 1e-7
-    assert float((state.position - points.position)[~right(points)].norm(dim=-1).max()) > 1e-2
+    assert peak((state.position - points.position)[right(points)]) < 1e-7
+    assert longest((state.position - points.position)[~right(points)]) > 1e-2
 
 
 @in_both
 def test_a_handle_leads_the_whole_part(formulation):
-    handle = Handle(Box([0.3, None, None], [None] * 3), angular_velocity=[0, 0, 2.0], pivot=[0.4, 0, 0], kind="nodes")
-    points, solver = bar(RigidRegion(RIGHT), handle, formulation=formulation, gravity=(0, 0, 0))
+    handle = Handle(beyond(x=0.3), angular_velocity=[0, 0, 2.0], pivot=[0.4, 0, 0], kind="nodes")
+    points, solver = bar(RigidRegion(RIGHT), handle, formulation=formulation, gravity=ZERO)
     state = advance(solver, solver.init_state(points), 0.25)
     s, c = math.sin(0.5), math.cos(0.5)
     turn = double([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
@@ -140,7 +138,7 @@ def test_scenes_of_a_batch_do_not_know_each_other():
 @in_both
 def test_it_has_gradients(formulation):
     """Of the height of the body by the stiffness of what it hangs on, against a difference."""
-    pin = PinnedRegion(Box([None] * 3, [0.1, None, None]), "nodes")
+    pin = PinnedRegion(up_to(x=0.1), "nodes")
 
     def height(E):
         points, solver = bar(RigidRegion(RIGHT), pin, formulation=formulation, dx=0.1)
@@ -149,7 +147,7 @@ def test_it_has_gradients(formulation):
         state = solver.init_state(points, margin=3)
         return solver.rollout(state, 1e-3, 40).position[right(points), 2].mean()
 
-    E = torch.tensor(2e4, dtype=torch.float64, requires_grad=True)
+    E = double(2e4).requires_grad_()
     (slope,) = torch.autograd.grad(height(E), E)
     with torch.no_grad():
         difference = (height(E + 20) - height(E - 20)) / 40
@@ -164,18 +162,18 @@ def pendulum(dx):
     above, side = round(0.3 * count), round(6 * half / dx)
     down = -(torch.arange(-above, count, dtype=torch.float64) + 0.5) / count
     across = double([-1.0, 1.0]) * width / 2 / 3**0.5
-    inside = ((torch.arange(side, dtype=torch.float64) + 0.5) / side * 2 - 1) * half
+    inside = ((torch.arange(side).double() + 0.5) / side * 2 - 1) * half
     cord, box = torch.cartesian_prod(across, across, down), torch.cartesian_prod(inside, inside, inside)
     place = torch.cat([cord, box + torch.tensor([0, 0, -1 - half])])
     sizes = [len(cord), len(box)]
     volume = torch.repeat_interleave(torch.tensor([width**2 / count / 4, (2 * half / side) ** 3]), torch.tensor(sizes))
     density = torch.repeat_interleave(torch.tensor([100.0, mass / (2 * half) ** 3]), torch.tensor(sizes))
     points = solid(place, volume.double(), density.double(), E, 0.0)
-    wall, body = Box([None, None, 0.0], [None] * 3), Box([None] * 3, [None, None, -1.0])
+    wall, body = beyond(z=0.0), up_to(z=-1.0)
     boundaries = [PinnedRegion(wall, "clamp"), RigidRegion(body)]
-    hanging = MPMSolver(dx=dx, damping=8.0, boundaries=boundaries, gravity=(0, 0, -9.81))
+    hanging = MPMSolver(dx, damping=8.0, boundaries=boundaries, gravity=(0, 0, -9.81))
     state = advance(hanging, hanging.init_state(points), 1.0)
-    solver = MPMSolver(dx=dx, boundaries=boundaries, gravity=(0, 0, -9.81))
+    solver = MPMSolver(dx, boundaries=boundaries, gravity=(0, 0, -9.81))
     solver.init_state(points)
     node = state.grid.node_positions(place) + state.node_displacement
     push = torch.zeros_like(node)
@@ -209,17 +207,17 @@ def test_a_box_on_a_cord_is_a_pendulum(dx):
 
 def test_what_cannot_be_is_refused():
     points, solver = bar(RigidRegion(RIGHT), RigidRegion(Box([0.1, None, None], [0.2, None, None])))
-    with pytest.raises(ValueError, match="Two rigid parts touch"):
+    with value_error("Two rigid parts touch"):
         solver.init_state(points)
     parts = Union([RIGHT, Box([0.1, None, None], [0.2, None, None])])
     bar(RigidRegion(parts))[1].init_state(points)
-    for pin in (PinnedRegion(Box([0.3, None, None], [None] * 3), "clamp"), PinnedPoints([[0.35, 0.05, 0.05]])):
+    for pin in (PinnedRegion(beyond(x=0.3), "clamp"), PinnedPoints([[0.35, 0.05, 0.05]])):
         points, solver = bar(RigidRegion(RIGHT), pin)
-        with pytest.raises(ValueError, match="points of a rigid part"):
+        with value_error("points of a rigid part"):
             solver.init_state(points)
     with pytest.raises(TypeError, match="start"):
         RigidRegion(RIGHT, start=0.1)  # it is rigid all the time
-    with pytest.raises(ValueError, match="holds no particle"):
+    with value_error("holds no particle"):
         bar(RigidRegion(Box([9.0] * 3, [10.0] * 3)))[1].init_state(points)
 
 
@@ -229,30 +227,30 @@ def test_in_total_a_part_falls_on_the_ground_and_rests_there():
     state = advance(solver, solver.init_state(points), 0.4)
     before = state.position
     state = advance(solver, state, 0.3)
-    assert float((state.position - before).abs().max()) < 2e-4
-    assert -0.045 < float(state.position[:, 2].min()) < -0.02
+    assert peak(state.position - before) < 2e-4
+    assert -0.045 < state.position[:, 2].min() < -0.02
     assert strain(state.F_total) < 1e-12
 
 
 def test_in_updated_parts_may_meet():
     """Each keeps its shape; the grid between them passes momentum on."""
-    left = Box([None] * 3, [0.2, None, None])
-    points, solver = bar(RigidRegion(left), RigidRegion(RIGHT), formulation="updated", gravity=(0, 0, 0))
+    left = up_to(x=0.2)
+    points, solver = bar(RigidRegion(left), RigidRegion(RIGHT), formulation="updated", gravity=ZERO)
     velocity = torch.where(right(points)[:, None], double([-1.0, 0.0, 0.0]), 0.0)
     state = solver.init_state(points, velocity, margin=4)
     before = solver.momenta(state)["linear"]
     state = advance(solver, state, 0.1)
     assert_close(solver.momenta(state)["linear"], before, rtol=1e-9, atol=1e-10)
-    assert float(state.velocity[~right(points), 0].max()) < -0.3  # it is pushed
+    assert state.velocity[~right(points), 0].max() < -0.3  # it is pushed
     for own in (right(points), ~right(points)):
         near(torch.pdist(state.position[own]), torch.pdist(points.position[own]), 1e-12)
 
 
 def test_a_part_that_becomes_rigid_on_the_way_takes_its_shape_again():
-    points, soft = bar(PinnedRegion(Box([None] * 3, [0.1, None, None]), "nodes"))
+    points, soft = bar(PinnedRegion(up_to(x=0.1), "nodes"))
     state = advance(soft, soft.init_state(points), 0.2)
     assert strain(state.F_total[right(points)]) > 1e-3
-    _, rigid = bar(PinnedRegion(Box([None] * 3, [0.1, None, None]), "nodes"), RigidRegion(RIGHT))
+    _, rigid = bar(PinnedRegion(up_to(x=0.1), "nodes"), RigidRegion(RIGHT))
     after = rigid.continued(soft, state, rigid.init_state(points))
     after = advance(rigid, after, 0.1)
     assert strain(after.F_total[right(points)]) < 1e-12

@@ -1,6 +1,7 @@
 """Sheets that touch."""
 
 import torch
+from shared import solid
 
 from gaussian_swaying import Contact, MaterialPoints, MPMSolver
 from gaussian_swaying.mpm.contact import Surface
@@ -9,13 +10,12 @@ SPACING, THICKNESS, APART = 0.02, 0.01, 0.2
 DX = 2.2 * SPACING
 
 
-def sheet(nx, ny, low=(0.0, 0.0, 0.0), dtype=torch.float64, spacing=SPACING, axes=(0, 1), **material):
+def sheet(nx, ny, low=(0.0, 0.0, 0.0), dtype=torch.float64, spacing=SPACING, axes=(0, 1), E=2e4):
     """A flat sheet of nx times ny points from a corner on, along two axes."""
     place = torch.zeros(nx * ny, 3, dtype=dtype)
     x, y = (torch.arange(n, dtype=dtype) * spacing for n in (nx, ny))
     place[:, axes[0]], place[:, axes[1]] = x.repeat_interleave(ny), y.repeat(nx)
-    given = {"density": 100.0, "youngs_modulus": 2e4, "poisson_ratio": 0.3} | material
-    return MaterialPoints.create(place + torch.tensor(low, dtype=dtype), volume=spacing**2 * THICKNESS, **given)
+    return solid(place + torch.tensor(low, dtype=dtype), spacing**2 * THICKNESS, E=E)
 
 
 def _surface(points, contact, normal=(0.0, 0.0, 1.0), spacing=SPACING):

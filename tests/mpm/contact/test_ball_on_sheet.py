@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from contacts import crossings, gaps, samples, sheet_triangles
-from shared import solid
+from shared import double, solid
 
 from gaussian_swaying import Box, Contact, MaterialPoints, MPMSolver, PinnedRegion
 from gaussian_swaying.geometry.regions import Not
@@ -15,15 +15,15 @@ from .bodies import march
 
 RADIUS, SPACING, THICKNESS, SIDE = 0.1, 0.02, 0.01, 26
 RINGS, AROUND = 11, 18
-CENTRE = torch.tensor([0.25, 0.25, 0.24], dtype=torch.float64)
+CENTRE = double([0.25, 0.25, 0.24])
 
 
 def _ball():
     """Points of a ball, and rings of places on its surface: (P, 3), (RINGS x AROUND, 3) unit vectors."""
-    axis = (torch.arange(20, dtype=torch.float64) - 9.5) * SPACING
+    axis = (torch.arange(20).double() - 9.5) * SPACING
     place = torch.cartesian_prod(axis, axis, axis)
-    polar = (torch.arange(RINGS, dtype=torch.float64) + 0.5) * math.pi / RINGS
-    turn = torch.arange(AROUND, dtype=torch.float64) * 2 * math.pi / AROUND
+    polar = (torch.arange(RINGS).double() + 0.5) * math.pi / RINGS
+    turn = torch.arange(AROUND).double() * 2 * math.pi / AROUND
     a, b = torch.cartesian_prod(polar, turn).unbind(-1)
     out = torch.stack([a.sin() * b.cos(), a.sin() * b.sin(), -a.cos()], dim=-1)
     return place[place.norm(dim=-1) < RADIUS - 0.25 * SPACING], out
@@ -31,8 +31,8 @@ def _ball():
 
 def _drop(friction=0.3, **settings):
     """The solver, its first state, and the triangles of both and of the ball, among the places that touch."""
-    x = torch.arange(SIDE, dtype=torch.float64) * SPACING
-    sheet = torch.cat([torch.cartesian_prod(x, x), torch.zeros(SIDE * SIDE, 1, dtype=torch.float64)], dim=-1)
+    x = torch.arange(SIDE).double() * SPACING
+    sheet = torch.cat([torch.cartesian_prod(x, x), torch.zeros(SIDE * SIDE, 1).double()], dim=-1)
     inner, out = _ball()
     ball = inner + CENTRE
     points = MaterialPoints.join(
@@ -43,7 +43,7 @@ def _drop(friction=0.3, **settings):
     )
     skin = CENTRE + RADIUS * out
     nearest = torch.cdist(skin, ball).argmin(1)
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(len(sheet), 3)
+    up = double([0.0, 0.0, 1.0]).expand(len(sheet), 3)
     radius = torch.cat([torch.full((len(sheet),), 0.75 * SPACING), torch.full((len(skin),), 1.3 * SPACING)]).double()
     surface = Surface(
         torch.cat([sheet, skin]),
@@ -55,7 +55,7 @@ def _drop(friction=0.3, **settings):
     )
     side = (SIDE - 1) * SPACING
     rim = Not(Box([0.01, 0.01, None], [side - 0.01, side - 0.01, None]))
-    solver = MPMSolver(dx=2.2 * SPACING, boundaries=[PinnedRegion(rim, kind="hinge")], **settings)
+    solver = MPMSolver(2.2 * SPACING, boundaries=[PinnedRegion(rim, kind="hinge")], **settings)
     state = solver.init_state(points, surface=surface)
     number = len(sheet) + torch.arange(RINGS * AROUND).reshape(RINGS, AROUND)
     closed = torch.cat([number, number[:, :1]], dim=1)
@@ -90,7 +90,7 @@ def test_a_ball_dropped_on_a_sheet_dents_it_and_bounces(seconds):
         sheets.append(float(later.position[:count, 2].min()))
     found = torch.cat(found)
     assert len(found) > 2100 * seconds
-    assert float((found < 0.5).double().mean()) <= 1e-3
+    assert (found < 0.5).double().mean() <= 1e-3
     lowest = min(range(len(heights)), key=heights.__getitem__)
     assert sheets[lowest] < -RADIUS  # a deep dent
     if seconds > 0.4:

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from shared import solid
+from shared import ZERO, double, in_both, longest, near, solid, value_error
 
 from gaussian_swaying import MPMSolver
 from gaussian_swaying.geometry.keyed_path import KeyedPath
@@ -12,11 +12,9 @@ from gaussian_swaying.mpm.colliders import BallObstacle, BoxObstacle, CapsuleObs
 
 from .bodies import march, scene, sheet
 
-FORMULATIONS = ["total", "updated"]
-
 
 def _block(side=0.3, per_side=6, bottom=0.0):
-    axis = (torch.arange(per_side, dtype=torch.float64) + 0.5) * side / per_side - side / 2
+    axis = (torch.arange(per_side).double() + 0.5) * side / per_side - side / 2
     place = torch.cartesian_prod(axis, axis, axis)
     place[:, 2] += bottom - float(place[:, 2].min())
     return solid(place, (side / per_side) ** 3, 500.0, 2e5)
@@ -36,7 +34,7 @@ def _roll(solver, state, frames, frame=0.04):
 
 @pytest.mark.slow(gate=["0.5-total-0.5", "-0.5-updated-0.5"])
 @pytest.mark.parametrize("friction", [0.2, 0.5])
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 @pytest.mark.parametrize("degrees", [-0.5, 0.5])
 def test_a_block_slides_beyond_the_angle_of_friction(formulation, friction, degrees):
     """Half a degree above arctan(mu) it gains g (sin a - mu cos a), half a degree below it loses as much, or rests.
@@ -47,7 +45,7 @@ def test_a_block_slides_beyond_the_angle_of_friction(formulation, friction, degr
     angle = math.atan(friction) + math.radians(degrees)
     gravity = (9.8 * math.sin(angle), 0.0, -9.8 * math.cos(angle))
     ground = HalfSpaceObstacle([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], friction)
-    solver = MPMSolver(dx=0.1, formulation=formulation, gravity=gravity, stiffness_damping=2e-3, boundaries=[ground])
+    solver = MPMSolver(0.1, formulation, gravity=gravity, stiffness_damping=2e-3, boundaries=[ground])
     settled = _roll(solver, solver.init_state(_block()), 10)
     end = _roll(solver, settled, 8)
     before, after = (float(_mean_velocity(solver, state)[0]) for state in (settled, end))
@@ -60,7 +58,7 @@ def test_a_block_slides_beyond_the_angle_of_friction(formulation, friction, degr
 
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", ["ground", "block", "capsule"])
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_a_moving_obstacle_moves_what_lies_on_it(formulation, shape):
     """A lift that rises at 0.5 m/s with much friction also carries the block sideways; all start at rest."""
     keys = [[0.0, 0.0, 0.0], [0.1, 0.0, 0.05], [0.5, 0.0, 0.25]]
@@ -70,36 +68,34 @@ def test_a_moving_obstacle_moves_what_lies_on_it(formulation, shape):
         "block": lambda: BoxObstacle([-0.6, -0.6, -0.3], [0.6, 0.6, 0.0], friction=2.0, path=path),
         "capsule": lambda: CapsuleObstacle([-9.0, 0.0, -4.0], [9.0, 0.0, -4.0], 4.0, 2.0, path=path),
     }[shape]()
-    solver = MPMSolver(dx=0.1, formulation=formulation, stiffness_damping=2e-3, boundaries=[obstacle])
+    solver = MPMSolver(0.1, formulation, stiffness_damping=2e-3, boundaries=[obstacle])
     state = _roll(solver, solver.init_state(_block()), 22)
-    torch.testing.assert_close(
-        _mean_velocity(solver, state), torch.tensor([0.5, 0.0, 0.25], dtype=torch.float64), rtol=0, atol=0.05
-    )
+    near(_mean_velocity(solver, state), double([0.5, 0.0, 0.25]), 0.05)
 
 
 @pytest.mark.parametrize("frames", [8, pytest.param(20, marks=pytest.mark.slow)])
 def test_a_block_that_rests_stays_where_it_is(frames):
     """In `total` the lowest points lie on the ground within the overlap that carries their weight, of order g dt²."""
     ground = HalfSpaceObstacle([0.0, 0.0, 0.0], [0.0, 0.0, 1.0])
-    solver = MPMSolver(dx=0.1, stiffness_damping=5e-3, boundaries=[ground])
+    solver = MPMSolver(0.1, stiffness_damping=5e-3, boundaries=[ground])
     state = _roll(solver, solver.init_state(_block(bottom=0.005)), frames)
     lowest = state.position[:, 2].min()
     assert abs(float(lowest)) < 1e-4
-    assert float(state.velocity.norm(dim=-1).max()) < 1e-3
-    assert float(state.position[:, 2].mean()) > 0.1
+    assert longest(state.velocity) < 1e-3
+    assert state.position[:, 2].mean() > 0.1
 
 
 def test_a_fast_sheet_does_not_pass_a_thin_rod():
     """50 m/s onto a rod of 4 cm: three times its width in a frame."""
     points = sheet(16, 16)
-    velocity = torch.tensor([0.0, 0.0, -50.0], dtype=torch.float64).expand(points.count, 3)
+    velocity = double([0.0, 0.0, -50.0]).expand(points.count, 3)
     rod = CapsuleObstacle([0.15, -1.0, -0.05], [0.15, 2.0, -0.05], 0.02)
-    solver, state = scene(points, boundaries=[rod], velocity=velocity, gravity=(0, 0, 0))
-    below = torch.tensor([0.15, 0.0, -0.05], dtype=torch.float64)
+    solver, state = scene(points, boundaries=[rod], velocity=velocity, gravity=ZERO)
+    below = double([0.15, 0.0, -0.05])
     for later in march(solver, state, 0.01, frame=0.001):
         arm = (later.position - below)[:, [0, 2]]
-        assert bool(torch.isfinite(later.position).all())
-        assert float(arm.norm(dim=-1).min()) > 0.02
+        assert torch.isfinite(later.position).all()
+        assert arm.norm(dim=-1).min() > 0.02
 
 
 def _flying_ball(speed=1e4, turns=(), **settings):
@@ -107,7 +103,7 @@ def _flying_ball(speed=1e4, turns=(), **settings):
     times, moves = [0.0, 1.0, 1.0 + 0.4 / speed], [[0, 0, -0.2], [0, 0, -0.2], [0, 0, 0.2]]
     ball = BallObstacle([0.1, 0.1, 0.0], 0.18, friction=0.0, path=KeyedPath(times, moves, list(turns)))
     points = sheet(11, 11)
-    solver = MPMSolver(dx=0.044, formulation="updated", gravity=(0, 0, 0), boundaries=[ball], **settings)
+    solver = MPMSolver(0.044, "updated", gravity=ZERO, boundaries=[ball], **settings)
     state = solver.init_state(points)
     return solver, state, state.replace(time=state.time + 1.0)
 
@@ -123,11 +119,11 @@ def test_a_ball_at_ten_kilometres_a_second_does_not_pass_a_sheet():
     assert steps == math.ceil(1e4 * frame / 0.044 / solver.cfl)
     end = solver.rollout(solver.fit_grid(state, frame, margin=10), frame / steps, steps)
     hit = (state.position - state.position.mean(0))[:, :2].norm(dim=-1) < 0.05
-    assert float(end.position[hit, 2].min()) > 0.2  # ahead of its centre
-    away = (end.position - torch.tensor([0.1, 0.1, 0.2], dtype=torch.float64)).norm(dim=-1)
-    assert float(away.min()) > 0.18 - 0.044  # outside, to a cell
+    assert end.position[hit, 2].min() > 0.2  # ahead of its centre
+    away = (end.position - double([0.1, 0.1, 0.2])).norm(dim=-1)
+    assert away.min() > 0.18 - 0.044  # outside, to a cell
     through = solver.rollout(solver.fit_grid(state, frame, margin=10), frame, 1, check=False)
-    assert float(through.position[hit, 2].max()) < 0.1  # the ball is past them
+    assert through.position[hit, 2].max() < 0.1  # the ball is past them
     assert solver.bound.obstacle_cells(end.replace(time=end.time + frame), frame) == 0.0  # its motion is over
 
 
@@ -135,14 +131,10 @@ def test_substeps_in_which_an_obstacle_would_jump_are_refused():
     solver, still, state = _flying_ball()
     solver.rollout(still, 4e-5, 2)
     for call in (lambda: solver.step(state, 4e-5), lambda: solver.rollout(state, 4e-5, 2)):
-        with pytest.raises(
-            ValueError, match=r"moves by 9.09 cells in a substep of 4e-05 s.* lower `dt` to at most 4.4e-06"
-        ):
+        with value_error(r"moves by 9.09 cells in a substep of 4e-05 s.* lower `dt` to at most 4.4e-06"):
             call()
     fixed, _, state = _flying_ball(substep=4e-5)
-    with pytest.raises(
-        ValueError, match=r"An obstacle moves by 9.09 cells .* lower `solver.substep` to at most 4.4e-06"
-    ):
+    with value_error(r"An obstacle moves by 9.09 cells .* lower `solver.substep` to at most 4.4e-06"):
         fixed.substeps(state, 4e-4)
 
 

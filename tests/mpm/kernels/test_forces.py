@@ -3,6 +3,7 @@
 import pytest
 import torch
 from catalogue import ELASTIC, PLASTIC
+from shared import in_both
 
 from gaussian_swaying import Force, PinnedRegion, WindField
 from gaussian_swaying.kernels.language import tl, triton
@@ -27,7 +28,7 @@ from .bodies import (
 )
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_the_cap_on_the_area_acts(kernel_device, formulation):
     """It is also read again in each rollout: a recorded graph stores the address that it reads, not the value."""
     points = make_points(kernel_device)
@@ -43,7 +44,7 @@ def test_the_cap_on_the_area_acts(kernel_device, formulation):
     assert gained[2:] == pytest.approx(gained[:3], rel=1e-5)
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_forces_and_drag_of_step(kernel_device, formulation):
     """Drag without a force adds nothing to the work."""
     points = make_points(kernel_device)
@@ -109,7 +110,7 @@ FORCES = {
     indirect=["kernel_device"],
     ids=str,
 )
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_forces_in_torch_among_the_kernels(kernel_device, formulation, case, monkeypatch):
     """Across the end of a part, with particles sorted again, boundaries, and with a batch; all forces and their work.
 
@@ -143,7 +144,7 @@ def test_forces_in_torch_among_the_kernels(kernel_device, formulation, case, mon
 
 
 @pytest.mark.parametrize("kernel_device", ["cpu"], indirect=True)
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_a_force_that_cannot_be_recorded_is_asked_by_the_host(kernel_device, formulation):
     """The other forces then run in torch as well."""
     points = make_points(kernel_device, count=12)
@@ -207,7 +208,7 @@ class _Toward(Force):
 
 @pytest.mark.slow(gate=["cpu-total-False", "cpu-updated-True"])
 @pytest.mark.parametrize("resists", [False, True])
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_a_twin_from_outside(kernel_device, formulation, resists):
     """Alone, with winds before and after it, and without it again."""
     points = make_points(kernel_device, count=12)
@@ -227,7 +228,7 @@ def test_a_twin_from_outside(kernel_device, formulation, resists):
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@in_both
 def test_forces_in_torch_are_replayed_from_graphs(formulation):
     """Python is not called after recording; changes in place take effect, and a changed number is recorded again."""
     pytest.importorskip("triton")

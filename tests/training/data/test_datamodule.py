@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from shared import near, value_error
 from small_captures import arc, write_transforms
 from torch.testing import assert_close
 
@@ -36,7 +37,7 @@ def test_a_batch_is_an_image_with_its_camera(folder):
     assert torch.equal(batch["pixels"], pixels)
     assert batch["image"].shape == (16, 20, 3)
     assert batch["alpha"].shape == (16, 20, 1)
-    assert_close(batch.image * batch.alpha, pixels[..., :3] / 255, rtol=0, atol=1e-6)
+    near(batch.image * batch.alpha, pixels[..., :3] / 255, 1e-6)
     assert batch.get("mask") is None
     with pytest.raises(KeyError):
         batch["mask"]
@@ -70,7 +71,7 @@ def test_only_the_images_of_the_stage_are_read(folder):
     (folder / "images/003.png").write_bytes((folder / "images/003.png").read_bytes()[:60])  # its header is whole
     data = CaptureDataModule(folder)
     data.setup("test")
-    with pytest.raises(ValueError, match=r"images/003\.png cannot be read"):
+    with value_error(r"images/003\.png cannot be read"):
         data.setup("fit")
 
 
@@ -131,9 +132,9 @@ def test_a_checkpoint_of_other_images_or_another_seed_is_refused(folder):
     order = _indices(CaptureDataModule(folder), 9)
     assert _indices(data, 4) == order[5:]
     assert data.state_dict() == state
-    with pytest.raises(ValueError, match=r"seed.*was 0.*is 4 now"):
+    with value_error(r"seed.*was 0.*is 4 now"):
         CaptureDataModule(folder, seed=4).load_state_dict(state)
-    with pytest.raises(ValueError, match=r"number of training images.*was 7.*is 9 now"):
+    with value_error(r"number of training images.*was 7.*is 9 now"):
         CaptureDataModule(folder, test_every=0).load_state_dict(state)
 
 
@@ -164,16 +165,16 @@ def test_a_capture_of_another_unit_looks_the_same(tmp_path):
         pictures.append(drawn.color)
     assert pictures[0].std() > 0.01
     for picture in pictures[1:]:
-        torch.testing.assert_close(picture, pictures[0], rtol=0, atol=1e-4)
+        near(picture, pictures[0], 1e-4)
 
 
 def test_bad_arguments(folder):
-    with pytest.raises(ValueError, match="`workers`"):
+    with value_error("`workers`"):
         CaptureDataModule(folder, workers=-1)
-    with pytest.raises(ValueError, match="`initial_opacity`"):
+    with value_error("`initial_opacity`"):
         CaptureDataModule(folder, initial_opacity=1.0)
     for scale in (0.0, 1e-30, 1e30, math.nan):
-        with pytest.raises(ValueError, match=r"`initial_scale` from 0\.001 to 100"):
+        with value_error(r"`initial_scale` from 0\.001 to 100"):
             CaptureDataModule(folder, initial_scale=scale)
-    with pytest.raises(ValueError, match="`format`"):
+    with value_error("`format`"):
         CaptureDataModule(folder, format="nerf").setup()

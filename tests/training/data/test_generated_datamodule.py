@@ -5,6 +5,7 @@ import shutil
 
 import pytest
 import torch
+from shared import value_error
 
 from gaussian_swaying.captures.generated_capture import GeneratedCapture
 from gaussian_swaying.training.data.generated_datamodule import GeneratedDataModule
@@ -36,10 +37,10 @@ def test_images_are_drawn_once(tmp_path):
 
 def test_other_things_are_left_alone(tmp_path):
     _data(tmp_path / "flag").setup("test")
-    with pytest.raises(ValueError, match="made with another ripple: remove it or set `path`"):
+    with value_error("made with another ripple: remove it or set `path`"):
         _data(tmp_path / "flag", ripple=0.1).setup("fit")
     (tmp_path / "mine").mkdir()
-    with pytest.raises(ValueError, match="is not a generated capture"):
+    with value_error("is not a generated capture"):
         _data(tmp_path / "mine").setup("fit")
 
 

@@ -4,8 +4,8 @@ import base64
 
 import numpy as np
 import pytest
-import torch
 from browsers import asked_of_a_network, listened, picture_of, until
+from shared import double, longest, peak
 
 from gaussian_swaying.viewer.film import page as film_page
 from gaussian_swaying.viewer.film.page import write_film
@@ -77,13 +77,13 @@ def test_the_film_is_the_run(show, film, run, make_flag, stretched):
         page.evaluate(f"film.seek({frame.index})")
         assert page.evaluate("film.frame()") == frame.index
         values = page.evaluate("film.positions().then((found) => Array.from(found))")
-        found = torch.tensor(values, dtype=torch.float64).reshape(-1, 3)
+        found = double(values).reshape(-1, 3)
         expected = scene.frame.point_to_sim(scene.deformed(frame.state).means.double()) / size
-        assert float((found - expected[order_of(scene)[1]]).norm(dim=-1).max()) < 1e-3  # of the object's size
+        assert longest(found - expected[order_of(scene)[1]]) < 1e-3  # of the object's size
         pictures[frame.index] = _picture(page)
         assert _psnr(pictures[frame.index], iio.imread(run / f"frames/{frame.index:05d}.png")) > 45
     assert np.abs(pictures[0] - pictures[5]).max() > 50
-    assert float((expected - scene.frame.point_to_sim(scene.rest().means.double()) / size).abs().max()) > 0.02
+    assert peak(expected - scene.frame.point_to_sim(scene.rest().means.double()) / size) > 0.02
     before = page.evaluate("film.drawn()")
     page.evaluate("film.play()")
     until(lambda: page.evaluate("film.drawn()") >= before + 5)

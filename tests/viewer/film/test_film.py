@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from shared import refused
+from shared import EYE, longest, peak, refused, seeded, value_error
 from small_scenes import together
 
 from gaussian_swaying.cli.export import main
@@ -52,7 +52,7 @@ def moved(film, frame):
         gradient += q[:, :, None] * torch.stack(along, dim=-1)[:, None, :]
     still = (place[:, 0] < 0)[:, None]
     u = torch.where(still, 0, u)
-    F = torch.eye(3).double() + torch.where(still[..., None], 0, gradient / head["cell"])
+    F = EYE + torch.where(still[..., None], 0, gradient / head["cell"])
     centre = torch.from_numpy(film.position).double()
     arm = centre - (place * head["cell"] + torch.tensor(head["corner"]))
     own = covariance(torch.from_numpy(film.turn).double() / 32767, torch.from_numpy(film.scale).double())
@@ -68,16 +68,16 @@ def check(simulation, film, frame, state):
     drawn = replace(drawn, means=drawn.means[film.order], covariances=drawn.covariances[film.order])
     position, shape = moved(film, frame)
     expected = scene.frame.point_to_sim(drawn.means.double()) / size
-    most = float(state.node_displacement.abs().max()) / size
+    most = float(peak(state.node_displacement)) / size
     rounding = most * 2**-11  # of each node; the weights are positive and add up to 1
     in_gradient = 2 * rounding / film.head["cell"]  # slopes of a quadratic spline add up to at most 2
-    arms = 0.0 if scene.follow.arm is None else float(scene.follow.arm.norm(dim=-1).max()) / size
-    assert float((position - expected).abs().max()) <= rounding + 3 * in_gradient * arms + 1e-6
-    assert float((position - expected).norm(dim=-1).max()) < 1e-3
+    arms = 0.0 if scene.follow.arm is None else float(longest(scene.follow.arm)) / size
+    assert peak(position - expected) <= rounding + 3 * in_gradient * arms + 1e-6
+    assert longest(position - expected) < 1e-3
     wanted = scene.frame.covariance_to_sim(drawn.covariances.double()) / size**2
     scale = wanted.diagonal(dim1=-2, dim2=-1).sum(-1)
     stored = 2 * 2**-9 + 1e-4  # float16 of a logarithm between 4 and 8 in size, twice; quaternions
-    assert float(((shape - wanted).abs().amax((-1, -2)) / scale).max()) <= stored + 6 * in_gradient
+    assert ((shape - wanted).abs().amax((-1, -2)) / scale).max() <= stored + 6 * in_gradient
     return most
 
 
@@ -175,7 +175,7 @@ def test_a_large_film_comes_in_parts(run, monkeypatch):
 
 def test_what_comes_first_is_spread_over_all():
     """Of places along a line any first part leaves no gap longer than four times the mean; none is missing."""
-    places = torch.rand(1000, 1, generator=torch.Generator().manual_seed(0)).sort(0)[0] * torch.tensor([1.0, 0.0, 0.0])
+    places = torch.rand(1000, 1, generator=seeded(0)).sort(0)[0] * torch.tensor([1.0, 0.0, 0.0])
     order = spread(places)
     assert sorted(order.tolist()) == list(range(1000))
     for count in (8, 30, 200, 999):
@@ -195,9 +195,9 @@ def test_gaussians_grow_less_where_many_lie_behind_each_other(make_flag):
         simulation = Simulation(scene, Material(), camera=camera, device="cpu")
         found.append(growth(simulation.scene, simulation.painter.camera_at(0))[: len(cloud)])
     few, many = found
-    assert float(many.max()) < 1
+    assert many.max() < 1
     assert torch.allclose(torch.where(few < 1, 10 * many, few), few, rtol=1e-5)
-    assert float((few < 1).float().mean()) > 0.2
+    assert (few < 1).float().mean() > 0.2
 
 
 def test_the_program_is_built_from_its_sources(request):
@@ -221,7 +221,7 @@ def test_the_program_is_built_from_its_sources(request):
 
 def test_nodes_that_swing_far_keep_their_digits(tmp_path):
     """Nodes with hardly any mass move by thousands of metres, beyond what float16 rounds well or holds at all."""
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     moved = (torch.rand(50, 3, generator=generator) - 0.5).numpy()
     moved[[3, 20]] = [[1e5, 2.00001, -3e7], [0.1, 0.61, 0.2]]
     near, far = split_far(moved, 0.6)
@@ -231,7 +231,7 @@ def test_nodes_that_swing_far_keep_their_digits(tmp_path):
     assert near.dtype == np.float16
     assert split_far(moved[:0], 0.6)[1].shape == (0, 4)
     np.savez(tmp_path / "nodes.npz", displacement_00000=near, far_00000=np.full((1, 4), 77, np.int32))
-    with pytest.raises(ValueError, match=r"nodes\.npz is damaged \(index 77 is out of bounds"):
+    with value_error(r"nodes\.npz is damaged \(index 77 is out of bounds"):
         load_nodes(tmp_path / "nodes.npz")
 
 
@@ -240,7 +240,7 @@ def test_damaged_nodes_are_not_added_to(make_flag, tmp_path):
     make_flag().run(folder, 3, progress=False)
     assert load_nodes(folder / "nodes.npz").dtype == torch.float32
     (folder / "nodes.npz").write_bytes((folder / "nodes.npz").read_bytes()[:5000])
-    with pytest.raises(ValueError, match=r"nodes\.npz is not a \.npz file, or is incomplete"):
+    with value_error(r"nodes\.npz is not a \.npz file, or is incomplete"):
         make_flag().run(folder, FRAMES + 1, resume=True, progress=False)
 
 

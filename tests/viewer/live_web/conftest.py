@@ -8,7 +8,7 @@ import pytest
 import torch
 import yaml
 from browsers import listened, until
-from shared import merged
+from shared import double, longest, merged
 from small_scenes import GREEN, block, previewed
 
 from gaussian_swaying.simulation.simulation import Simulation
@@ -106,8 +106,8 @@ def moved_means(simulation, state, moved):
 def apart(simulation, state, moved):
     """The largest distance of a Gaussian from its place in a state over the largest motion of one, and that motion."""
     expected = simulation.scene.deformed(state).means
-    motion = (expected - simulation.scene.rest().means).norm(dim=-1).max()
-    error = (moved_means(simulation, state, moved) - expected).norm(dim=-1).max()
+    motion = longest(expected - simulation.scene.rest().means)
+    error = longest(moved_means(simulation, state, moved) - expected)
     return float(error / motion), float(motion)
 
 
@@ -122,7 +122,7 @@ def opened(context, path, settings):
 def drawn_apart(page, simulation):
     """As :func:`apart`, of the Gaussians as a page draws them, read back from there; in sizes of the object."""
     values = page.evaluate("windPage.positions().then((found) => Array.from(found))")
-    found = torch.tensor(values, dtype=torch.float64).reshape(-1, 3)
+    found = double(values).reshape(-1, 3)
     state = simulation.start()
     for _ in range(round(page.evaluate("windPage.time() ?? 0") / simulation.frame_dt)):
         state, _ = simulation.advance(state)
@@ -131,5 +131,5 @@ def drawn_apart(page, simulation):
     rest, expected = (
         scene.frame.point_to_sim(drawn.means.double())[order] / size for drawn in (scene.rest(), scene.deformed(state))
     )
-    motion = float((expected - rest).norm(dim=-1).max())
-    return float((found - expected).norm(dim=-1).max()) / motion, motion
+    motion = float(longest(expected - rest))
+    return float(longest(found - expected)) / motion, motion

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from shared import longest, value_error
 from small_scenes import together
 
 from gaussian_swaying.gaussians.ply import write_ply
@@ -125,7 +126,7 @@ def test_contact_with_what_stands_still(make, in_node, name):
     simulation = make(solver={"boundaries": [pins, *OBSTACLES[name]]})
     state, steps = run(simulation, 50)
     free, _ = run(make(), 50)
-    stopped = (state.position - free.position).norm(dim=-1).max()
+    stopped = longest(state.position - free.position)
     for plain in (False, True):
         told, moved = in_node(simulation, {"kind": "frames", "count": 50}, plain=plain)
         error, motion = apart(simulation, state, moved)
@@ -146,13 +147,13 @@ def test_the_starter_of_a_plant_by_its_modes(sway, in_node):
     told, moved = in_node(simulation, {"kind": "frames", "count": 50})
     error, motion = apart(simulation, state, moved)
     assert motion > 0.05
-    assert float((state.position - steady.position).norm(dim=-1).max()) > 0.1 * motion
+    assert longest(state.position - steady.position) > 0.1 * motion
     assert error < ROUNDED
     assert told[0]["substeps"] == steps
     effects = [
         {"class_path": f"gaussian_swaying.wind.{name}"} for name in ("turbulence.Turbulence", "effects.LogProfile")
     ]
-    with pytest.raises(ValueError, match=r"of which `solver.formulation: modes` takes one Turbulence\.$"):
+    with value_error(r"of which `solver.formulation: modes` takes one Turbulence\.$"):
         check(sway(wind={"effects": effects}))
 
 
@@ -187,8 +188,8 @@ def test_what_the_visitor_does(make, in_node):
     state = simulation.start()
     pulled = moved_means(simulation, state, moved)[:, 1]
     free = moved_means(simulation, state, in_node(simulation, grab, aim, {"kind": "release"}, frames)[1])[:, 1]
-    assert float(free.min()) > -0.05
-    assert -0.2 < float(pulled.min()) < -0.1
+    assert free.min() > -0.05
+    assert -0.2 < pulled.min() < -0.1
     beside, _ = in_node(make(), grab | {"eye": [2.0, 2.0, 0.0]})
     assert beside[0]["place"] is None
 
@@ -252,7 +253,7 @@ REFUSED = {
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_a_browser_cannot_simulate_is_refused(make, name):
-    with pytest.raises(ValueError, match=rf"^The page of --live-web cannot simulate .*{name}.*\.$"):
+    with value_error(rf"^The page of --live-web cannot simulate .*{name}.*\.$"):
         check(make(**REFUSED[name]))
 
 

@@ -1,6 +1,7 @@
 """The grid that fits a kind of machine."""
 
 import pytest
+from shared import value_error
 
 from gaussian_swaying.viewer.live_web.budget import finest_within
 
@@ -52,5 +53,5 @@ def test_too_coarse_a_grid_is_passed_over():
     dx, found = finest_within(load, 0.05, 1e6)
     assert 0.05 < dx <= 0.15
     assert found > 1e6
-    with pytest.raises(ValueError, match="the pin holds nothing"):
+    with value_error("the pin holds nothing"):
         finest_within(load, 0.2, 1e6)

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from shared import seeded
 
 from gaussian_swaying.viewer.live_web.longest import MARGIN, fastest_vibration, longest_courant
 
@@ -15,7 +16,7 @@ def test_what_shakes_grows_only_beyond_the_largest_stable_step(make, law):
     limit = 2 / fastest_vibration(bound)
     wave = (bound.laws.lam + 2 * bound.laws.mu)[0] * rest_volume(bound)
     assert longest_courant(bound) == pytest.approx(MARGIN * limit * float(wave) ** 0.5 / bound.settings.dx, rel=1e-5)
-    speed = 1e-4 * torch.randn(rest.node_velocity.shape, generator=torch.Generator().manual_seed(0))
+    speed = 1e-4 * torch.randn(rest.node_velocity.shape, generator=seeded(0))
     speed = torch.where(bound.node_inverse_mass[:, None] > 0, speed.to(rest.node_velocity), 0.0)
     start = bound.read_particles(rest, torch.zeros_like(speed), speed)
     grown = []
