@@ -21,7 +21,7 @@ from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.connectivity import pieces
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.hold import PIN_DEPTH, end_region, given_hold, guess_hold
-from gaussian_swaying.gaussians.measures import FEWEST, Array, Gaussians, corners, sheet_normal
+from gaussian_swaying.gaussians.measures import FEWEST, Array, Gaussians, corners, extent, sheet_normal
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.geometry.groups import equal_rows, joined
 from gaussian_swaying.geometry.neighbours import particle_spacing
@@ -135,8 +135,7 @@ def suggest(
     elif region is None and photos is None and (far := sky(all_of_it)).any():
         near = ~far
     gaussians = all_of_it if near is None else all_of_it[near]
-    if np.ptp(corners(gaussians.means), axis=0).max() <= 0:
-        raise ValueError("All Gaussians of the splat are at one point: there is no object to simulate.")
+    _check_extent(gaussians.means)
     shown = None if photos is None or region is not None or place is not None else shown_object(gaussians, photos)
     if place is not None:
         upward, ground = place.up, place.ground[near]
@@ -151,6 +150,7 @@ def suggest(
     # its parts and its size
     axis, simulated = np.array(upward.direction), moving.simulated
     own, support = gaussians[simulated], None
+    _check_extent(own.means)
     height = float(np.ptp(corners(own.means @ axis, 0.002)))
     if hold is None:
         support = potted_plant(own, axis) or flag_on_pole(own, axis) or washing_line(own, axis)
@@ -310,6 +310,12 @@ def why_apart(scene: SimulatedScene, dx: float, held: Tensor) -> str | None:
     if beside < ENOUGH or not bool(hangs.all()):
         return None
     return f"{100 * beside:.0f} % lie within reach of a node beside what they are not attached to"
+
+
+def _check_extent(points: Array) -> None:
+    """Raise ValueError if points are all one."""
+    if extent(points, 0.0) <= 0:
+        raise ValueError("All Gaussians of the object are at one point: there is nothing to simulate.")
 
 
 def broad_side(points: Array) -> float:

@@ -146,8 +146,9 @@ def test_too_little_is_refused():
         guess(tree().select(torch.arange(10)))
     with pytest.raises(ValueError, match=r"box of `--region` contains 0 Gaussians.*splat spans"):
         given_region(Gaussians.of(tree()), [90, 90, 90], [91, 91, 91])
-    with pytest.raises(ValueError, match="are at one point"):
-        guess(plain_cloud(torch.ones(50, 3)))
+    for points in (torch.ones(50, 3), (torch.arange(60) % 2).float()[:, None].expand(60, 3)):  # at one place, or two
+        with pytest.raises(ValueError, match="are at one point"):
+            guess(plain_cloud(points))
 
 
 @pytest.mark.parametrize(
