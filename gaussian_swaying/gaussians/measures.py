@@ -13,6 +13,8 @@ from gaussian_swaying.gaussians.area import patch_area
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.grouping import connected_parts
 from gaussian_swaying.gaussians.harmonics import SH_DC
+from gaussian_swaying.geometry.groups import equal_rows
+from gaussian_swaying.geometry.neighbours import particle_spacing
 from gaussian_swaying.geometry.patches import smallest_axis_normal
 
 Array = np.ndarray
@@ -116,9 +118,24 @@ def corners(points: Array, share: float = 0.005) -> Array:
     return np.quantile(points, (share, 1 - share), axis=0, method="nearest")
 
 
-def extent(points: Array, share: float) -> float:
-    """The longest side of points (N, ...) without a share of them at each end."""
-    return float(np.ptp(corners(points, share), axis=0).max())
+def sides(points: Array, share: float = 0.005) -> Array:
+    """The sides of points (N, ...) without a share of them at each end, shape (...)."""
+    return np.ptp(corners(points, share), axis=0)
+
+
+def extent(points: Array, share: float = 0.005) -> float:
+    """The longest of the :func:`sides` of points (N, ...)."""
+    return float(sides(points, share).max())
+
+
+def cells_of(points: Array, cell: float) -> Array:
+    """The cell of each point (N, K), numbered from 0 in their order, shape (N,)."""
+    return equal_rows(torch.from_numpy(np.floor(points / cell))).numpy()
+
+
+def spacing_of(points: Array) -> float:
+    """See :func:`particle_spacing`."""
+    return particle_spacing(torch.from_numpy(points))
 
 
 def plane_axes(axis: Sequence[float] | Array) -> Array:
@@ -135,7 +152,7 @@ def breadth(points: Array, axis: Sequence[float] | Array, share: float) -> float
 
 def width(points: Array, axis: Sequence[float] | Array) -> float:
     """Geometric mean of the widths of points perpendicular to an axis, robust."""
-    return math.sqrt(np.ptp(corners(points @ plane_axes(axis), 0.03), axis=0).clip(1e-9).prod())
+    return math.sqrt(sides(points @ plane_axes(axis), 0.03).clip(1e-9).prod())
 
 
 def slices_of(height: Array, count: int, share: float = 0.005) -> Array:

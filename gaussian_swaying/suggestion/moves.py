@@ -21,7 +21,7 @@ from gaussian_swaying.gaussians.measures import (
     Gaussians,
     Guess,
     breadth,
-    corners,
+    cells_of,
     extent,
     largest_plane,
     pieces,
@@ -30,10 +30,10 @@ from gaussian_swaying.gaussians.measures import (
     ranked,
     rounded,
     sheet_normal,
+    sides,
     snapped,
+    spacing_of,
 )
-from gaussian_swaying.geometry.groups import equal_rows
-from gaussian_swaying.geometry.neighbours import particle_spacing
 from gaussian_swaying.geometry.origin import NO_ORIGIN, Origin
 from gaussian_swaying.geometry.regions import Box, Cylinder, Not, Region, Union
 from gaussian_swaying.rendering.cameras.camera import Camera
@@ -219,9 +219,9 @@ def main_part(splat: Gaussians, ground: Array, cells: float, shown: Shown | None
     """
     among = np.ones(len(splat), bool) if shown is None else shown.mask
     own = splat[among]
-    spacing = particle_spacing(torch.from_numpy(own.means))
+    spacing = spacing_of(own.means)
     # the rest of a backdrop must not count as a part of the object
-    cell = max(np.ptp(corners(own.means), axis=0).max() / cells, 2 * spacing) * (1.0 if shown is None else 0.5)
+    cell = max(extent(own.means) / cells, 2 * spacing) * (1.0 if shown is None else 0.5)
     threshold = suggest_threshold(own)
     index = np.flatnonzero((splat.opacity >= threshold) & ~ground & among)
     if len(index) < FEWEST:
@@ -395,7 +395,7 @@ def survey(splat: Gaussians, up: Guess | None = None, cameras: Sequence[Camera] 
         return None
     threshold = suggest_threshold(splat[above])
     solid = above & (splat.opacity >= threshold)
-    cell = max(SPACINGS * particle_spacing(torch.from_numpy(means[solid])), size / CELLS)
+    cell = max(SPACINGS * spacing_of(means[solid]), size / CELLS)
     part = np.full(len(splat), -1)
     part[solid] = pieces(means[solid], cell)
     things = _things(splat, part, middle, size, cell, np.c_[plane_axes(normal), normal], cameras)
@@ -466,7 +466,7 @@ def _things(
         side = (high - low).max() / size
         if side < SMALLEST:
             continue
-        cells = int(equal_rows(torch.from_numpy(np.floor((points - low) / cell))).max()) + 1
+        cells = int(cells_of(points - low, cell).max()) + 1
         reasons = {
             "near the middle": 2 * math.exp(-((np.linalg.norm(0.5 * (low + high)) / (0.25 * size)) ** 2)),
             "of a size": min(1.0, 10 * side),
@@ -516,7 +516,7 @@ def _lowest(points: Array, axis: Array, side: float) -> Array:
     Columns are wider than ``side`` where most of them would have fewer points.
     """
     for _ in range(4):
-        column = equal_rows(torch.from_numpy(np.floor(points @ plane_axes(axis) / side))).numpy()
+        column = cells_of(points @ plane_axes(axis), side)
         count = np.bincount(column)
         if quantile(count, 0.5) >= FULL:
             break
@@ -617,7 +617,7 @@ def backdrops(points: Array, weight: Array, eyes: Array, reach: float, cell: flo
         reach: Distance to the side that photos show [scene units].
         cell: Coordinates of the regions are rounded to a hundredth of it [scene units].
     """
-    side = np.ptp(corners(points), axis=0).max()
+    side = extent(points)
     half = 0.03 * side
     left = np.ones(len(points), bool)  # neither in a backdrop nor behind one
     tried, found = np.zeros_like(left), list[Backdrop]()
@@ -636,7 +636,7 @@ def backdrops(points: Array, weight: Array, eyes: Array, reach: float, cell: flo
         if (eyes @ normal - offset > half).mean() < 0.9 or own < 0.15 * weight[left].sum() or front.sum() < FEWEST:
             continue
         flat = points @ plane_axes(normal)
-        wide, narrower = (np.ptp(corners(flat[part], 0.05), axis=0) for part in (layer, front))
+        wide, narrower = (sides(flat[part], 0.05) for part in (layer, front))
         if ahead < 0.05 * (own + ahead) or (wide <= np.maximum(0.8 * reach, 1.2 * narrower)).any():
             continue
         depth = 4 * side + 2 * half

@@ -15,7 +15,9 @@ from gaussian_swaying.gaussians.measures import (
     Gaussians,
     Guess,
     breadth,
+    cells_of,
     corners,
+    extent,
     pieces,
     plane_axes,
     quantile,
@@ -23,7 +25,6 @@ from gaussian_swaying.gaussians.measures import (
     slices_of,
 )
 from gaussian_swaying.gaussians.parts import Part, Parts
-from gaussian_swaying.geometry.groups import equal_rows
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.suggestion.moves import contains
 
@@ -292,7 +293,7 @@ def woody(points: Array, green: Array, size: float) -> Array:
     from scipy.sparse import coo_array
     from scipy.spatial import cKDTree
 
-    of_point = equal_rows(torch.from_numpy(np.floor(points / (CELL * size)))).numpy()
+    of_point = cells_of(points, CELL * size)
     cells = coo_array((np.ones(len(points)), (of_point, np.arange(len(points))))).tocsr()
     count = cells.sum(1)
     centre = (cells @ (points - points.mean(0)) / count[:, None]) / size
@@ -444,7 +445,7 @@ def standing(own: Gaussians, up: Array, depth: float) -> Labels | None:
     trunk or post.
     """
     height = own.means @ up
-    size, which = np.ptp(corners(height, 0.002)), slices_of(height, SLICES, 0.002)
+    size, which = extent(height, 0.002), slices_of(height, SLICES, 0.002)
     wide = np.array([breadth(own.means[which == k], up, 0.05) for k in range(SLICES)])
     narrow = (wide > 0) & (wide < NARROW * wide.max())
     start = next((k for k in range(FOOT) if narrow[k]), 0)  # above a lawn or a disc of soil

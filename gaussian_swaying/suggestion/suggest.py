@@ -21,10 +21,9 @@ from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.connectivity import pieces
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.hold import PIN_DEPTH, end_region, given_hold, guess_hold
-from gaussian_swaying.gaussians.measures import FEWEST, Array, Gaussians, corners, extent, sheet_normal
+from gaussian_swaying.gaussians.measures import FEWEST, Array, Gaussians, extent, sheet_normal, spacing_of
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.geometry.groups import equal_rows, joined
-from gaussian_swaying.geometry.neighbours import particle_spacing
 from gaussian_swaying.geometry.rotations import rotation_from_z
 from gaussian_swaying.mpm.materials import known_material
 from gaussian_swaying.mpm.modes import MOST_LEAN
@@ -151,7 +150,7 @@ def suggest(
     axis, simulated = np.array(upward.direction), moving.simulated
     own, support = gaussians[simulated], None
     _check_extent(own.means)
-    height = float(np.ptp(corners(own.means @ axis, 0.002)))
+    height = extent(own.means @ axis, 0.002)
     if hold is None:
         support = potted_plant(own, axis) or flag_on_pole(own, axis) or washing_line(own, axis)
     parts = labelled(gaussians, simulated, height, support and support[0])
@@ -166,7 +165,7 @@ def suggest(
         sized, simulated = simulated & ~parts.mask(AROUND), simulated & ~parts.mask(role="still")
         own = gaussians[simulated]
     unit = (longest_side or 1.0) / np.ptp(turned[sized], axis=0).max()
-    size, apart = np.ptp(turned[simulated], axis=0), particle_spacing(torch.from_numpy(own.means))
+    size, apart = np.ptp(turned[simulated], axis=0), spacing_of(own.means)
     dx = suggest_spacing(float(size.max() * unit), apart * unit, CELLS)
     # where it is held, and its kind
     cell, eyes = dx / unit, None if photos is None else photos.eyes

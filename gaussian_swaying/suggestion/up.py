@@ -21,6 +21,7 @@ from gaussian_swaying.gaussians.measures import (
     plane_axes,
     ranked,
     sheet_normal,
+    sides,
 )
 from gaussian_swaying.geometry.rotations import rotation_from_z
 
@@ -59,7 +60,7 @@ def floor_mask(splat: Gaussians, up: Sequence[float] | Array) -> Array:
     of it level. There is almost nothing below it and something above it that is narrower.
     """
     axis, weight, none = np.asarray(up), splat.weight, np.zeros(len(splat), bool)
-    side, total = np.ptp(corners(splat.means), axis=0).max(), weight.sum()
+    side, total = extent(splat.means), weight.sum()
     if side <= 0 or total <= 0:
         return none
     height, level, half = splat.means @ axis, np.abs(splat.normals @ axis) > 0.8, 0.02 * side
@@ -73,7 +74,7 @@ def floor_mask(splat: Gaussians, up: Sequence[float] | Array) -> Array:
         return none
     if weight[layer & level].sum() < 0.6 * own or above.sum() < FEWEST:
         return none
-    wide, narrower = (np.ptp(corners(splat.means[m] @ plane_axes(axis), 0.02), axis=0) for m in (layer, above))
+    wide, narrower = (sides(splat.means[m] @ plane_axes(axis), 0.02) for m in (layer, above))
     return none if (wide < 0.9 * narrower).any() else ~above
 
 
@@ -93,7 +94,7 @@ def guess_up(splat: Gaussians) -> tuple[Guess, Array]:
         axis, own = "xyz".index(name[1]), [(CONVENTION[name], PROGRAMS.get(name, ""))]
         floor = floors[name] = floor_mask(splat, direction)
         if floor.any():  # a thing on it that is flatter than 0.3 times its width counts less
-            wide = np.ptp(corners(splat.means[floor] @ plane_axes(direction), 0.02), axis=0).min()
+            wide = sides(splat.means[floor] @ plane_axes(direction), 0.02).min()
             tall = extent(splat.means[~floor] @ direction, 0.02)
             own.append((3 * min(1.0, tall / max(0.3 * wide, 1e-30)), "there is a level floor at the lower end"))
         near, far = (low[axis], high[axis]) if name[0] == "+" else (high[axis], low[axis])

@@ -191,21 +191,13 @@ def test_a_flag_without_its_pole_or_with_two_or_on_a_rod_has_no_pole():
     assert guess(FlagScene().generate()).parts is None
 
 
-def test_the_cloth_moves_and_not_the_pole(tmp_path):
+def test_a_flag_has_the_size_of_its_cloth_and_pole():
     cloud = flag_on_a_pole()
     found = guess(cloud, up="+z", quality="draft")
     assert (found.hold.name, found.hold.confidence, found.sheet) == ("side", "high", True)
     assert found.longest_side == pytest.approx(1.2 * found.metres_per_unit, rel=0.05)  # of the cloth
     size = float((cloud.means.amax(0) - cloud.means.amin(0)).amax())
     assert found.metres_per_unit == pytest.approx(1 / size, rel=1e-3)
-    simulation = started(found, cloud, tmp_path)
-    assert [type(pin).__name__ for pin in simulation.solver.boundaries] == ["PinnedRegion"]
-    last = list(simulation.frames(5))[-1]
-    moved = (last.gaussians.means - simulation.scene.rest().means).norm(dim=-1).numpy()
-    cloth = found.parts.mask("cloth")
-    assert moved[found.parts.mask("pole")].max() == 0.0
-    assert moved[cloth].max() > 0.01
-    assert moved[cloth & (cloud.means[:, 0] < 0.02).numpy()].max() < 0.2 * moved.max()
     assert guess(cloud, up="+z", hold="-x").parts is None
 
 
