@@ -14,8 +14,7 @@ from gaussian_swaying.cli.errors import run_command
 from gaussian_swaying.cli.scene import is_given, settings_of, words_of
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.controls import Page
-from gaussian_swaying.viewer.real_time import in_real_time
-from gaussian_swaying.viewer.session import Session, share_cores
+from gaussian_swaying.viewer.session import Session, in_real_time, share_cores
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace

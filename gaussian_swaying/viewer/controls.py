@@ -2,24 +2,793 @@
 
 from __future__ import annotations
 
+import html
 import math
-from collections.abc import Callable
+import os
+import shutil
+import tempfile
+import threading
+from collections import deque
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import count
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+import yaml
+from torch import Tensor
 
+from gaussian_swaying._checks import one_line
+from gaussian_swaying._devices import in_double
+from gaussian_swaying._inputs import spare_memory
+from gaussian_swaying.config.parser import parse_text
+from gaussian_swaying.gaussians.formats import READERS, read_gaussians
+from gaussian_swaying.gaussians.labelling import alike, connected
+from gaussian_swaying.gaussians.parts import ROLES, Part, Parts
 from gaussian_swaying.mpm.materials import MATERIALS, name_of
+from gaussian_swaying.mpm.pins import PinnedRegion
+from gaussian_swaying.rendering.brush import Seen, seen, touched
+from gaussian_swaying.rendering.cameras.camera import Camera, resized_intrinsics
 from gaussian_swaying.rendering.passes import colormap
+from gaussian_swaying.rendering.tints import TINTS
 from gaussian_swaying.simulation.draw import speed_scale
 from gaussian_swaying.simulation.model import POLAR, angles_of, flow_of, number
-from gaussian_swaying.viewer.files import Files
-from gaussian_swaying.viewer.gusts import Gusts
-from gaussian_swaying.viewer.holding import Holding
-from gaussian_swaying.viewer.painting import Painting
-from gaussian_swaying.viewer.pictures import SHOWN
+from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.suggestion.suggest import suggest
+from gaussian_swaying.viewer.pictures import SHOWN, FilmStrip, under_cursor
 from gaussian_swaying.viewer.screen import Panel, Screen
-from gaussian_swaying.viewer.session import Session
+from gaussian_swaying.viewer.session import Session, Snapshot
+from gaussian_swaying.viewer.streams import BrushMove
+
+KINDS = {"Sway": "SineSway", "Gusts": "UniformGust", "Noise": "GaussianGust"}
+FIELDS: dict[str, tuple[str, float, float, float]] = {  # label, least, most, step
+    "amplitude": ("Amplitude [share]", 0.0, 2.0, 0.05),
+    "delta": ("Strength [share]", 0.0, 1.0, 0.05),
+    "std": ("Strength [m/s]", 0.0, 10.0, 0.1),
+    "period": ("Period [s]", 0.05, 60.0, 0.05),
+    "phase": ("Phase [rad]", -6.3, 6.3, 0.1),
+    "interval": ("Interval [s]", 0.01, 10.0, 0.01),
+}
+NONE = "Add sway, gusts or noise"
+
+
+class Gusts:
+    """Shows the modulations of the wind, each with its numbers, and changes, adds and removes them.
+
+    Args:
+        controls: The panel; the folder of the wind is open.
+    """
+
+    def __init__(self, controls: Panel) -> None:
+        self._controls, self.session = controls, controls.session
+        self.gui = controls.server.gui
+        self.folder = self.gui.add_folder("Sway and gusts", expand_by_default=False)
+        self.removers: list[Any] = []
+        self.numbers: list[dict[str, Any]] = []  # the control of each number, for each modulation
+        self._parts: list[Any] = []
+        self._shown: list[dict[str, Any]] | None = None
+        with self.folder:
+            self.add = self.gui.add_dropdown("More", (NONE, *KINDS), initial_value=NONE)
+        controls.on(self.add.on_update, self._add)
+        self.show()
+
+    def show(self) -> None:
+        there = self._there()
+        if there == self._shown:
+            return
+        self._shown = there
+        for part in self._parts:
+            part.remove()
+        self._parts, self.numbers, self.removers = [], [], []
+        names = [_name(modulation) for modulation in there]
+        self.folder.label = f"Sway and gusts: {', '.join(names).lower() or 'none'}"
+        with self.folder:
+            for place, modulation in enumerate(there):
+                self._show_one(place, modulation)
+
+    def _show_one(self, place: int, modulation: dict[str, Any]) -> None:
+        folder = self.gui.add_folder(f"{place + 1}: {_name(modulation)}")
+        found: dict[str, Any] = {}
+        with folder:
+            for field, value in (modulation.get("init_args") or {}).items():
+                if isinstance(value, bool) or not isinstance(value, (int, float)):
+                    continue
+                label, least, most, step = FIELDS.get(field, (field, -math.inf, math.inf, 0.1))
+                least, most = min(least, value), max(most, value)
+                control = found[field] = self.gui.add_number(label, float(value), min=least, max=most, step=step)
+                self._controls.on(control.on_update, self._changed)
+            remove = self.gui.add_button("Remove")
+            self._controls.on(remove.on_click, lambda: self._remove(place))
+        self._parts.append(folder)
+        self.numbers.append(found)
+        self.removers.append(remove)
+
+    def _there(self) -> list[dict[str, Any]]:
+        return [_plain(modulation) for modulation in self.session.settings.wind.modulations or ()]
+
+    def _changed(self) -> None:
+        changed: dict[str, Any] = {}
+        for place, (modulation, controls) in enumerate(zip(self._shown or [], self.numbers, strict=True)):
+            arguments = modulation["init_args"]
+            for field, control in controls.items():
+                if (value := type(arguments[field])(control.value)) != arguments[field]:
+                    arguments[field] = changed[f"wind.modulations.{place}.{field}"] = value
+        if changed:
+            self.session.change(changed)
+
+    def _add(self) -> None:
+        if self.add.value != NONE:
+            kind = KINDS[self.add.value]
+            self.add.value = NONE  # type: ignore[misc]
+            self._set([*self._there(), {"class_path": kind}])
+
+    def _remove(self, place: int) -> None:
+        self._set([modulation for k, modulation in enumerate(self._there()) if k != place])
+
+    def _set(self, modulations: list[dict[str, Any]]) -> None:
+        self.session.change({"wind.modulations": modulations})
+
+
+def _plain(modulation: Any) -> dict[str, Any]:
+    return {"class_path": modulation["class_path"], "init_args": dict(modulation.get("init_args") or {})}
+
+
+def _name(modulation: dict[str, Any]) -> str:
+    kind = modulation["class_path"].rsplit(".", 1)[-1]
+    return next((name for name, known in KINDS.items() if known == kind), kind)
+
+
+if TYPE_CHECKING:
+    import viser
+
+
+class Holding:
+    """Grabs the object where it is clicked, and pins the material in a box.
+
+    Args:
+        controls: The panel; a folder of it is open.
+    """
+
+    def __init__(self, controls: Panel) -> None:
+        self._controls, self.page = controls, controls.page
+        self.session, self.server = controls.session, controls.server
+        self._pin: Any = None
+        self._handle: Any = None
+        self._grabbed = False  # whether what the handle pulls is held by now
+        gui = self.server.gui
+        gui.add_markdown("Click on the object to take hold of it, then drag the axes that appear.")
+        self.release = gui.add_button("Let go of it", disabled=True)
+        self.new_pin = gui.add_button("New pin box", hint="Drag it over what should be held, at rest")
+        self.pin_size = gui.add_slider("Size of the box [% of the object]", 2, 100, 1, 15)
+        self.hold = gui.add_button("Hold what is in the box", disabled=True)
+        self.free = gui.add_button("Let go of all pins")
+        controls.on(self.release.on_click, self.let_go)
+        controls.on(self.new_pin.on_click, self._place_pin)
+        controls.on(self.pin_size.on_update, self._size_pin)
+        controls.on(self.hold.on_click, self._hold_box)
+        controls.on(self.free.on_click, lambda: self.session.change({"solver.boundaries": []}))
+        controls.on(self.server.scene.on_click(), self._clicked, tell_event=True)
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        with self.session.lock:
+            place = under_cursor(self.session.snapshot, event.ray_origin, event.ray_direction)
+        if place is None:
+            return
+        self.let_go()
+        self.session.grab(place)
+        size = self.session.simulation.scene.size
+        self._handle = self.server.scene.add_transform_controls(
+            "/pull", scale=0.25 * size, disable_rotations=True, depth_test=False, position=np.array(place)
+        )
+        self._controls.on(self._handle.on_update, self._dragged)
+        self.release.disabled = False
+
+    def _dragged(self) -> None:
+        if self._handle is not None:
+            self.session.drag([float(x) for x in self._handle.position])
+
+    def let_go(self) -> None:
+        handle, self._handle = self._handle, None
+        if handle is not None:
+            handle.remove()
+        self.release.disabled = True
+        self.session.let_go()
+
+    def _place_pin(self) -> None:
+        scene = self.session.simulation.scene
+        place = tuple(scene.center.tolist())
+        if self._pin is not None:
+            place = self._pin.position
+        self._pin = self.server.scene.add_transform_controls(
+            "/pin", scale=0.2 * scene.size, disable_rotations=True, depth_test=False, position=place
+        )
+        self._size_pin()
+        self.hold.disabled = False
+
+    def _size_pin(self) -> None:
+        if self._pin is not None:
+            size = (self._pin_side(),) * 3
+            self.server.scene.add_box("/pin/box", (220, 120, 40), size, wireframe=True)
+
+    def _pin_side(self) -> float:
+        return self.session.simulation.scene.size * self.pin_size.value / 100
+
+    def _hold_box(self) -> None:
+        if self.session.settings.normalisation is not None:
+            self.page.tell("Pins of this configuration are in normalised coordinates: write them into its file.")
+            return
+        centre, half = np.array(self._pin.position), 0.5 * self._pin_side()
+        box = {"min": [float(f"{x:.6g}") for x in centre - half], "max": [float(f"{x:.6g}") for x in centre + half]}
+        pin = {
+            "class_path": "PinnedRegion",
+            "init_args": {"kind": None, "region": {"class_path": "Box", "init_args": box}},
+        }
+        known = yaml.safe_load(self.session.yaml())["solver"].get("boundaries") or []
+        self.session.change({"solver.boundaries": [*known, pin]})
+
+    def follow(self) -> None:
+        """Remove the handle of the mouse if the session has released the material."""
+        if self._handle is not None and self._grabbed and not self.session.pulls:
+            self.let_go()
+        self._grabbed = self._handle is not None and self.session.pulls
+
+    def forget_box(self) -> None:
+        """Remove the box for pins, as there is another scene."""
+        if self._pin is not None:
+            self._pin.remove()
+            self._pin = None
+            self.hold.disabled = True
+
+    def places(self) -> np.ndarray:
+        """Places at rest of the material points that pins and handles hold [scene units], shape (N, 3)."""
+        with self.session.lock:  # a change binds the solver anew
+            scene, solver = self.session.simulation.scene, self.session.simulation.solver
+        held = torch.zeros(scene.points.count, dtype=torch.bool, device=scene.points.position.device)
+        for boundary in solver.framed(scene.frame):
+            if isinstance(boundary, PinnedRegion):
+                held |= boundary.particle_mask(scene.points.position)
+        return scene.frame.point_to_scene(in_double(scene.points.position[held])).cpu().numpy()
+
+
+MOST_KEPT = 100  # strokes that can be taken back
+
+
+@dataclass(frozen=True, eq=False)
+class Stroke:
+    """A stroke, and what it replaced.
+
+    Attributes:
+        part: The part to which it gave Gaussians.
+        mark: As in :meth:`Strokes.paint`.
+        index: The Gaussians that it changed, each once, shape (M,).
+        labels: Their labels before, shape (M,).
+        known: The parts before.
+    """
+
+    part: Part
+    mark: Hashable
+    index: Tensor
+    labels: Tensor
+    known: tuple[Part, ...]
+
+
+class Strokes:
+    """The labels of all Gaussians of a splat, stroke by stroke.
+
+    Args:
+        parts: The parts at first.
+
+    Attributes:
+        known: The parts that there are.
+        labels: The part of each Gaussian, as its place in ``known``, int64, shape (N,).
+        roles: Index of each Gaussian's role in :data:`~gaussian_swaying.gaussians.parts.ROLES`, uint8, shape (N,);
+            another tensor after each change.
+    """
+
+    def __init__(self, parts: Parts) -> None:
+        self.labels, self.known = parts.labels.clone(), parts.parts
+        self._past: deque[Stroke] = deque(maxlen=MOST_KEPT)
+        self.roles = self._roles_of(self.labels)
+
+    def __len__(self) -> int:
+        """The number of strokes that can be taken back."""
+        return len(self._past)
+
+    @property
+    def last(self) -> Stroke | None:
+        """The last stroke, or None."""
+        return self._past[-1] if self._past else None
+
+    def parts(self) -> Parts:
+        return Parts(self.labels.clone(), self.known)
+
+    def paint(self, part: Part, index: Tensor, mark: Hashable = None, goes_on: bool = False) -> None:
+        """Give Gaussians to a part, which is new or the one with its name; nothing happens if it has them all.
+
+        Args:
+            part: The part.
+            index: The Gaussians, each once, int64, shape (M,).
+            mark: Anything that tells strokes apart.
+            goes_on: Whether this belongs to the last stroke, if part and mark are the same; both go back together.
+        """
+        names, known = [each.name for each in self.known], self.known
+        place = names.index(part.name) if part.name in names else len(names)
+        index = index[self.labels[index] != place]
+        if len(index) == 0:
+            return
+        labels = self.labels[index]
+        last = self.last
+        if goes_on and last is not None and (last.part, last.mark) == (part, mark):
+            self._past.pop()
+            index, labels, known = torch.cat([last.index, index]), torch.cat([last.labels, labels]), last.known
+        self._past.append(Stroke(part, mark, index, labels, known))
+        self.known = (*self.known[:place], part, *self.known[place + 1 :])
+        self._label(index, torch.full_like(index, place))
+
+    def take_back(self) -> None:
+        """Take the last stroke back; nothing happens without one."""
+        if self._past:
+            last = self._past.pop()
+            self.known = last.known
+            self._label(last.index, last.labels)
+
+    def _label(self, index: Tensor, labels: Tensor) -> None:
+        self.labels[index] = labels
+        roles = self.roles.clone()
+        roles[index] = self._roles_of(labels)
+        self.roles = roles
+
+    def _roles_of(self, labels: Tensor) -> Tensor:
+        return torch.tensor([ROLES.index(part.role) for part in self.known], dtype=torch.uint8)[labels]
+
+
+if TYPE_CHECKING:
+    import viser
+
+MOST_WAITING = 1000  # moves of brushes
+DEPTH_SIDE = 640  # most pixels of the longer side of the picture that says what is hidden
+SLACK = 0.01  # longest sides that something may lie behind that picture and still be on the surface
+NEAR = 5.0  # pixels within which the dabs of a double click lie
+JOINED, ALIKE = "what is connected", "what looks alike"
+FILE = "parts.npz"
+
+
+@dataclass(eq=False)
+class Mark:
+    """Tells a stroke of a browser from others.
+
+    Attributes:
+        key: The browser.
+        start: Where it began [pixels].
+        length: How far it went from there [pixels].
+    """
+
+    key: str
+    start: list[float]
+    length: float = 0.0
+
+    def is_dab(self, key: str, place: list[float]) -> bool:
+        """True if the stroke is one of a browser, and stayed at a place [pixels]."""
+        return key == self.key and self.length <= NEAR and math.dist(self.start, place) <= NEAR
+
+
+class Painting:
+    """Paints the parts of the scene at rest; the simulation takes them when they are applied.
+
+    Args:
+        controls: The panel; a folder of it is open.
+    """
+
+    def __init__(self, controls: Panel) -> None:
+        self.page, self.session = controls.page, controls.session
+        self._strokes: Strokes | None = None
+        self._source: tuple[str, ...] = ()  # of the Gaussians that they paint
+        self._choices: dict[str, Part] = {}
+        self._mark: Mark | None = None  # of the last stroke
+        self._waiting: deque[tuple[str, BrushMove]] = deque()
+        self._view: tuple[Any, Seen] | None = None  # of the last camera
+        self._paints = False
+        self._paused = False  # whether the session was, before
+        self._numbers = count(1)  # of the files that were applied
+        gui = controls.server.gui
+        gui.add_markdown(
+            "Drag over the object to paint it. With Shift, and with other buttons, the mouse turns the view."
+        )
+        self.on = gui.add_checkbox("Paint", False, hint="The object stays at rest meanwhile")
+        self.part = gui.add_dropdown("Paint as", ROLES, initial_value="held")
+        self.size = gui.add_slider("Brush [pixels]", 4, 400, 2, 40)
+        self.through = gui.add_checkbox("Hidden, too", False, hint="The brush reaches through the object")
+        self.double = gui.add_dropdown("Double click", (JOINED, ALIKE), hint="From one Gaussian to the next")
+        self.back = gui.add_button("Undo the stroke", disabled=True)
+        self.apply = gui.add_button("Apply the parts", disabled=True, hint="The simulation takes them, from rest")
+        self.save = gui.add_button("Save the parts", disabled=True, hint=f"A file {FILE}, for `scene.parts`")
+        self.legend = gui.add_html("", visible=False)
+        controls.on(self.on.on_update, lambda: self._begin() if self.on.value else self.stop())
+        controls.on(self.size.on_update, self._tell_brushes)
+        controls.on(self.back.on_click, self._take_back)
+        controls.on(self.apply.on_click, self._apply)
+        controls.on(self.save.on_click, self._save, tell_event=True)
+        self.page.brushes.take = self._came
+        self._show()
+
+    # ---- on and off
+
+    def _begin(self) -> None:
+        if self._paints:
+            return
+        if self.session.settings.copies:
+            self.on.value = False  # type: ignore[misc]
+            self.page.tell("Parts are painted on one object: leave out `copies`.")
+            return
+        with self.session.lock:
+            self._adopt(self.session.simulation)
+        self._paints = True
+        self._paused = self.session.paused
+        self.session.pause()
+        self.session.reset()
+        self._show()
+        self._tell_brushes()
+
+    def stop(self) -> None:
+        """Paint no longer; the simulation goes on if it did before, and what was painted is kept."""
+        if self._paints:
+            self._paints = False
+            self.on.value = False  # type: ignore[misc]
+            self._show()
+            self._tell_brushes()
+            self.session.pause(self._paused)
+
+    def forget(self) -> None:
+        self.stop()
+        self._strokes = self._view = self._mark = None
+        self._show()
+
+    def _adopt(self, simulation: Simulation) -> Strokes:
+        """The strokes on the Gaussians of a simulation; those on others are forgotten."""
+        scene, settings = simulation.scene, self.session.settings.scene
+        source = (str(settings.ply), str(settings.generator), str(len(scene.drawn)))
+        if self._strokes is None or source != self._source:
+            self._source = source
+            everything = Parts(torch.zeros(len(scene.drawn)), [Part("soft")])
+            self._strokes = Strokes(scene.parts or everything)
+        return self._strokes
+
+    def _tell_brushes(self) -> None:
+        self.page.brushes.tell(self._paints, 0.5 * self.size.value)
+
+    def _show(self) -> None:
+        strokes, scene = self._strokes, self.session.simulation.scene
+        on = strokes is not None and self._paints
+        roles = None
+        if strokes is not None and on:
+            roles = strokes.roles if bool(scene.drawn.all()) else strokes.roles[scene.drawn]
+        self.page.roles = roles  # at once, as other threads draw them
+        self.page.redraw()
+        self.back.disabled = not on or strokes is None or len(strokes) == 0
+        self.apply.disabled, self.save.disabled = strokes is None, strokes is None and scene.parts is None
+        self.legend.visible = on
+        if strokes is None or not on:
+            return
+        self._choices = choices(strokes.known)
+        if tuple(self._choices) != self.part.options:
+            self.part.options = tuple(self._choices)
+        counts = torch.bincount(strokes.labels, minlength=len(strokes.known)).tolist()
+        self.legend.content = parts_legend(strokes.known, counts)
+
+    # ---- strokes
+
+    def _came(self, key: str, move: BrushMove) -> None:
+        if len(self._waiting) < MOST_WAITING:
+            self._waiting.append((key, move))
+            self.page.turns.ask("brush", self._take)
+
+    def _take(self) -> None:
+        try:
+            while self._waiting:
+                key, move = self._waiting.popleft()
+                if self._paints:
+                    self._paint(key, move)
+        finally:
+            self._show()
+            if self._waiting:  # after an error
+                self.page.turns.ask("brush", self._take)
+
+    def _paint(self, key: str, move: BrushMove) -> None:
+        with self.session.lock:
+            snapshot = self.session.snapshot
+            strokes = self._adopt(snapshot.simulation)
+            if not self._choices:
+                self._choices = choices(strokes.known)
+            view = self._seen(snapshot, move)
+        part = self._choices.get(self.part.value)
+        if part is None:  # another scene has others
+            return
+        path = torch.tensor(move.path, dtype=torch.float64)
+        if move.kind == "part":
+            for _ in range(2):  # the double click itself
+                last = strokes.last
+                if last is not None and isinstance(last.mark, Mark) and last.mark.is_dab(key, move.path[0]):
+                    strokes.take_back()
+            found = self._hangs_together(snapshot.simulation, view, path)
+            strokes.paint(part, _in_source(snapshot.simulation, found))
+            return
+        mark = self._mark
+        goes_on = mark is not None and mark.key == key and not move.first
+        if mark is None or not goes_on:
+            mark = self._mark = Mark(key, move.path[0])
+        mark.length = max(mark.length, *(math.dist(mark.start, corner) for corner in move.path))
+        index = touched(view, path, 0.5 * self.size.value, self.through.value)
+        strokes.paint(part, _in_source(snapshot.simulation, index), mark, goes_on)
+
+    def _seen(self, snapshot: Snapshot, move: BrushMove) -> Seen:
+        """The Gaussians as a browser sees them; kept until it looks from elsewhere, or they move."""
+        key = (snapshot.number, move.size, move.fov, move.near, move.matrix)
+        if self._view is not None and self._view[0] == key:
+            return self._view[1]
+        painter, camera = snapshot.simulation.painter, self.page.camera_of(move)
+        share = min(1.0, DEPTH_SIDE / max(move.size))
+        width, height = (max(1, round(share * side)) for side in move.size)
+        (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
+        intrinsics, *_ = resized_intrinsics(*move.size, fx, fy, cx, cy, width, height)
+        small = Camera(camera.world_to_camera, intrinsics, width, height, camera.near)
+        with torch.no_grad(), snapshot.simulation.turn:
+            gaussians = painter.deformed(snapshot.state)
+            means = gaussians.means
+            picture = painter.draw(gaussians, torch.zeros_like(means), small.to(means.device, means.dtype))
+            view = seen(means, gaussians.covariances, camera, picture, SLACK * snapshot.simulation.scene.size)
+        self._view = (key, view)
+        return view
+
+    def _hangs_together(self, simulation: Simulation, view: Seen, place: Tensor) -> Tensor:
+        """All that hangs together with the Gaussian in front next to a place [pixels]; none beside the object."""
+        index = touched(view, place[:1], max(NEAR, 0.5 * self.size.value))
+        if len(index) == 0:
+            return index
+        centre = torch.stack([view.column[index], view.row[index]], -1).double()
+        nearest = index[(centre - place[0]).square().sum(-1).argmin()]
+        self.page.progress(0.5, "Looking for what hangs together")
+        try:
+            with simulation.turn:
+                cloud = simulation.scene.model.to_cloud().to("cpu")
+            seed = cloud.means[nearest].tolist()
+            return (connected if self.double.value == JOINED else alike)(cloud, seed).nonzero()[:, 0]
+        finally:
+            self.page.progress(None)
+
+    def _take_back(self) -> None:
+        if self._strokes is not None:
+            self._strokes.take_back()
+            self._show()
+
+    # ---- what comes of it
+
+    def _apply(self) -> None:
+        strokes, session = self._strokes, self.session
+        if strokes is None:
+            return
+        painted = self.page.scratch / "painted"
+        parts, path = strokes.parts(), painted / str(next(self._numbers)) / FILE
+        path.parent.mkdir(parents=True)
+        parts.save(path)
+        changes: dict[str, Any] = {"scene.parts": str(path)}
+        with session.lock:
+            scene, settings = session.simulation.scene, session.settings
+            before = (
+                torch.zeros(len(parts), dtype=torch.bool) if scene.parts is None else scene.parts.mask(role="still")
+            )
+            if settings.scene.longest_side is not None and not torch.equal(before, parts.mask(role="still")):
+                changes |= {"scene.longest_side": None, "scene.metres_per_unit": scene.frame.metres_per_unit}
+        self.stop()
+        session.change(changes)
+        with session.lock:  # so that none is being read
+            kept = {str(known.scene.parts) for known in session.reachable()} | {str(path)}
+        for folder in painted.iterdir():
+            if str(folder / FILE) not in kept:
+                shutil.rmtree(folder)
+
+    def _save(self, event: viser.GuiEvent) -> None:
+        parts = self.session.simulation.scene.parts if self._strokes is None else self._strokes.parts()
+        if parts is not None and event.client is not None:
+            with tempfile.TemporaryDirectory() as folder:
+                content = parts.save(Path(folder) / FILE).read_bytes()
+            event.client.send_file_download(FILE, content, save_immediately=True)
+
+    def as_saved(self, text: str) -> str:
+        """A configuration that is saved from the page; parts whose file goes away with the page lie beside it."""
+        path = Path(str(self.session.settings.scene.parts))
+        if not path.is_relative_to(self.page.scratch):
+            return text
+        return f"# Save the parts, too, and run it in their folder\n{text.replace(str(path), FILE)}"
+
+
+def _in_source(simulation: Simulation, index: Tensor) -> Tensor:
+    drawn = simulation.scene.drawn
+    return index if bool(drawn.all()) else drawn.nonzero()[:, 0][index]
+
+
+def choices(known: Sequence[Part]) -> dict[str, Part]:
+    """The parts that Gaussians can become, by their names on the page: those that there are, and one of each role."""
+    found = {part.name if part.name == part.role else f"{part.name} ({part.role})": part for part in known}
+    names = {part.name for part in known}
+    return found | {role: Part(role, role) for role in ROLES if role not in names}
+
+
+def parts_legend(known: Sequence[Part], counts: Sequence[int]) -> str:
+    """The parts with their tints and how many Gaussians they have, as HTML.
+
+    Args:
+        known: The parts.
+        counts: How many Gaussians each has.
+    """
+    lines = []
+    for part, many in zip(known, counts, strict=True):
+        tint = TINTS.get(part.role, (190, 190, 190))
+        colour = "none" if part.role == "soft" else f"rgb({','.join(map(str, tint))})"
+        square = f"display: inline-block; width: 0.8em; height: 0.8em; border: 1px solid #888; background: {colour}"
+        name = html.escape(part.name if part.name == part.role else f"{part.name} ({part.role})")
+        lines.append(f'<div><span style="{square}"></span> {name}: {many:,} Gaussians</div>')
+    return f'<div style="padding: 0 0.8em 0.6em; font-size: 0.8em">{"".join(lines)}</div>'
+
+
+if TYPE_CHECKING:
+    from jsonargparse import ArgumentParser, Namespace
+
+SPARE = 1 << 26
+"""Memory that a splat may take besides a multiple of its size [bytes]: less than elsewhere, as others may upload it."""
+
+
+def settings_of_splat(
+    parser: ArgumentParser,
+    path: str | os.PathLike[str],
+    device: torch.device,
+    folder: Path,
+    further: Sequence[str] = (),
+    tell: Callable[[float, str], None] = lambda share, what: None,
+    quick: bool = False,
+) -> Namespace:
+    """The settings that the preview suggests for a splat.
+
+    Args:
+        parser: From :meth:`Simulation.parser`.
+        path: The splat.
+        device: Device of the simulation.
+        folder: Gets ``parts.npz``, which the settings name, if the splat has parts.
+        further: Options that replace what is suggested.
+        tell: Called with the share that is done, from 0 to 1, and the name of the next task.
+        quick: Whether the grid is a coarser one than that of its starter.
+    """
+    tell(0.05, "Reading the splat")
+    with spare_memory(SPARE):
+        gaussians = read_gaussians(path)
+    tell(0.15, "Looking for a region, pins, a grid and how it sways")
+    found = suggest(gaussians, quality="draft" if quick else "normal", device=device.type)
+    found.to_yaml(folder / "starter.yaml", splat=Path(path))
+    return parser.parse_args(["--config", str(folder / "starter.yaml"), "--device", device.type, *further])
+
+
+if TYPE_CHECKING:
+    import viser
+    from jsonargparse import Namespace
+
+Folder = tempfile.TemporaryDirectory[str]
+UPLOADS = [suffix for suffix in READERS if suffix not in (".json", ".gltf")]  # with files beside them
+RECORD = "Record a video (simulated time)"
+
+
+class Files:
+    """Saves videos and configurations, and loads configurations and splats.
+
+    Args:
+        controls: The panel; a folder of it is open.
+        loaded: Called when another scene is there.
+        as_saved: Changes the text of a configuration before it is saved.
+    """
+
+    def __init__(self, controls: Panel, loaded: Callable[[], None], as_saved: Callable[[str], str]) -> None:
+        self._loaded, self._as_saved, self.page, self.session = loaded, as_saved, controls.page, controls.session
+        self._upload: Folder | None = None  # where the splat lies that was loaded
+        gui, elsewhere = controls.server.gui, self.page.door.token is not None
+        self.record = gui.add_button(
+            RECORD, hint="The video shows real time: if the simulation is slower, it takes longer to record"
+        )
+        self.save = gui.add_button("Save the configuration", hint="A YAML file that `gaussian-swaying sim` runs")
+        self.load_settings = gui.add_upload_button(
+            "Load a configuration (.yaml)",
+            mime_type=".yaml,.yml",
+            disabled=elsewhere,  # a configuration can name files of this computer
+            hint="Only on a page that other computers cannot open" if elsewhere else "Such as one that was saved here",
+        )
+        kinds = ",".join(UPLOADS)
+        self.load = gui.add_upload_button("Load a splat", mime_type=kinds, hint=f"One of {kinds}")
+        controls.on(self.record.on_click, self._toggle_recording, tell_event=True)
+        controls.on(self.save.on_click, self._save, tell_event=True)
+        controls.on(self.load.on_upload, lambda: self._load(self.load, self._splat))
+        controls.on(self.load_settings.on_upload, lambda: self._load(self.load_settings, self._configuration))
+
+    def _toggle_recording(self, event: viser.GuiEvent) -> None:
+        if self.page.recording is None:
+            self.page.recorder = event.client_id
+            self.page.recording = FilmStrip()
+            self.record.label = "Stop recording"
+        else:
+            self.stop_recording(event.client)
+
+    def stop_recording(self, client: viser.ClientHandle | None) -> None:
+        film, self.page.recording = self.page.recording, None
+        self.record.label = RECORD
+        if film is None:
+            return
+        try:
+            content = film.finish()
+        except (ValueError, OSError) as error:
+            self.page.tell(str(error))
+            return
+        if film.full:
+            self.page.tell(f"The video has the greatest length, {film.seconds:.0f} s, and was saved.")
+        if client is not None:
+            client.send_file_download("wind.mp4", content, save_immediately=True)
+
+    def _save(self, event: viser.GuiEvent) -> None:
+        text = self._as_saved(self.session.yaml())
+        if self._upload is not None and self._upload.name in text:  # it goes away with the program
+            text = "# Give the splat that you loaded: --scene.ply PATH\n" + text.replace(self._upload.name + "/", "")
+        if event.client is not None:
+            event.client.send_file_download("live.yaml", text.encode(), save_immediately=True)
+
+    def _load(self, button: viser.GuiUploadButtonHandle, read: Callable[[bytes, str, Folder], Namespace]) -> None:
+        self.load.disabled = self.load_settings.disabled = True
+        threading.Thread(target=self._read, args=(button, read), name="load", daemon=True).start()
+
+    def _read(self, button: viser.GuiUploadButtonHandle, read: Callable[[bytes, str, Folder], Namespace]) -> None:
+        """Load an uploaded file; of its name, only the ending is used."""
+        folder = Folder()
+        try:
+            try:
+                settings = read(button.value.content, Path(button.value.name).suffix.lower(), folder)
+            finally:  # before another file may come
+                button._impl.value = replace(button.value, content=b"")
+            self.page.progress(0.8, "Making the simulation")
+            self.session.load(settings, partial(self._there, folder), self._ended)
+        except Exception as error:
+            self.page.tell(one_line(error))
+            self._ended()
+            folder.cleanup()
+
+    def _ended(self) -> None:
+        self.page.progress(None)
+        self.load.disabled, self.load_settings.disabled = False, self.page.door.token is not None
+
+    def _splat(self, content: bytes, suffix: str, folder: Folder) -> Namespace:
+        path = Path(folder.name) / f"scene{suffix if suffix in UPLOADS else '.ply'}"
+        path.write_bytes(content)
+        device = self.session.simulation.device
+        quick = device.type == "cpu"  # no trial looks for a grid
+        return settings_of_splat(self.session.parser, path, device, path.parent, tell=self.page.progress, quick=quick)
+
+    def _configuration(self, content: bytes, suffix: str, folder: Folder) -> Namespace:
+        """The settings in a configuration file; if its splat is not on this computer, they get the present one."""
+        self.page.progress(0.1, "Reading the configuration")
+        try:
+            text = content.decode()
+        except UnicodeDecodeError:
+            raise ValueError("The configuration is not UTF-8 text: save it as UTF-8.") from None
+        settings = parse_text(self.session.parser, text, ["--device", self.session.simulation.device.type])
+        splat = self.session.settings.scene.ply
+        if settings.scene.ply is not None and not Path(settings.scene.ply).exists():
+            if splat is None:
+                raise ValueError(f"The configuration is for {settings.scene.ply}, which is not here: load it first.")
+            settings.scene.ply = splat
+        return settings
+
+    def _there(self, folder: Folder) -> None:
+        """Adapt to another scene; called in the thread of the session."""
+        if str(self.session.settings.scene.ply).startswith(folder.name):
+            self._upload = folder  # and the one before goes
+        self.page.turns.ask("loaded", self._loaded)
+
 
 if TYPE_CHECKING:
     import viser
@@ -427,7 +1196,6 @@ FEELS = (
     (1e9, "hard plastic"),
     (1e10, "metal or stone"),
 )
-
 _UNITS = ((1e9, "GPa"), (1e6, "MPa"), (1e3, "kPa"), (0.0, "Pa"))
 
 

@@ -2,26 +2,177 @@
 
 from __future__ import annotations
 
+import copy
+import math
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
+import yaml
+from torch import Tensor
 
 from gaussian_swaying._checks import one_line
 from gaussian_swaying.config.parser import config_text
+from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.rendering.gsplat_renderer import make_renderer
 from gaussian_swaying.rendering.thinning import DETAIL
+from gaussian_swaying.simulation.body import SimulatedScene, suggest_spacing
 from gaussian_swaying.simulation.measure import FrameDiagnostics, SimulationDiverged
-from gaussian_swaying.simulation.model import find, of_settings
+from gaussian_swaying.simulation.model import find, in_settings, number, of_settings
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.viewer.changes import changed_settings, take
-from gaussian_swaying.viewer.pull import Pull
+from gaussian_swaying.suggestion.cost import Cost, estimate_cost
+from gaussian_swaying.suggestion.suggest import QUALITIES
+
+if TYPE_CHECKING:
+    from jsonargparse import ArgumentParser, Namespace
+
+PICTURE = ("shader", "background")
+"""Fields besides the numbers that change in motion."""
+
+SHADER = "shader.init_args."
+
+
+def changed_settings(parser: ArgumentParser, settings: Namespace, values: Mapping[str, Any]) -> Namespace:
+    """Settings with other values. Parameters are checked and set; only other fields are parsed anew.
+
+    Args:
+        parser: From :meth:`Simulation.parser`.
+        settings: Settings from it.
+        values: New values by the names of their fields, with dots, or of parameters.
+    """
+    numbers = {name: value for name, value in values.items() if find(name) is not None}
+    shader = {name: value for name, value in values.items() if name.startswith(SHADER)}
+    further = {name: value for name, value in values.items() if name not in numbers and name not in shader}
+    if further:
+        data = yaml.safe_load(parser.dump(settings, skip_validation=True))
+        for name, value in further.items():
+            *path, last = name.split(".")
+            part = data
+            for key in path:
+                if not isinstance(part.get(key), dict):
+                    part[key] = {}
+                part = part[key]
+            part[last] = value
+        settings = parser.parse_object(data)
+    else:
+        settings = copy.deepcopy(settings)
+    for name, value in shader.items():
+        settings[name] = value
+    in_settings(settings, numbers)
+    return settings
+
+
+def take(simulation: Simulation, parser: ArgumentParser, settings: Namespace, values: Mapping[str, Any]) -> bool:
+    """Change a simulation between two steps.
+
+    Parameters, the wind, aerodynamic coefficients, shading, background and length of a frame change in motion; the
+    material only if it is the same everywhere.
+
+    Args:
+        simulation: The simulation.
+        parser: From :meth:`Simulation.parser`.
+        settings: The settings with all changes.
+        values: New values of numbers by their names, and the other fields that have changed, with dots.
+
+    Returns:
+        False if another field has changed, so that the simulation has to be made anew.
+    """
+    numbers = {name: value for name, value in values.items() if find(name) is not None}
+    heads = {name.split(".")[0] for name in values if name not in numbers}
+    if not heads <= {"wind", "aero", *PICTURE}:
+        return False
+    if "frame_dt" in numbers and simulation.model.air is not None:
+        return False  # computed air has one length of the frame
+    if any(name.startswith("material.") for name in numbers) and (simulation.material.regions or settings.edits):
+        return False  # each part has its own
+    if not all(number(name).same_points for name in numbers):
+        return False
+    if settings.wind.schedule is not None or heads & {"wind", "aero"}:  # as a whole
+        heads |= {name.split(".")[0] for name in numbers} & {"wind", "aero"}
+        numbers = {name: value for name, value in numbers.items() if name.split(".")[0] not in heads}
+    parts = parser.instantiate(settings) if heads else {}
+    painter = simulation.painter
+    if numbers:
+        simulation.change(numbers)
+    if "wind" in heads:
+        simulation.wind = parts["wind"]
+    if "aero" in heads:
+        simulation.aero = parts["aero"]
+    if "shader" in heads:
+        painter.shader = None if parts["shader"] is None else parts["shader"].to(simulation.device)
+    if "background" in heads:
+        painter.background = torch.tensor(parts["background"], dtype=torch.float32, device=simulation.device)
+    return True
+
+
+REACH = 0.06  # radius of what is grabbed, as a share of the longest side
+QUICK = 40.0  # 1/s: how quickly what is grabbed follows, if nothing else acts on it
+STRONGEST = 400.0  # m/s²: largest acceleration of what is grabbed
+
+
+class Pull(Force):
+    """Pulls some particles towards a place, with a spring and a damper that stops it from swinging.
+
+    Args:
+        share: Strength with which each particle is pulled, from 0 to 1, shape (P,).
+        mass: Mass of each particle [kg], shape (P,).
+        offset: From the mean of the pulled particles to each particle [m], shape (P, 3).
+        target: Place to which their mean is pulled [m], shape (3,).
+        frame: Transform between the scene and metres.
+    """
+
+    recordable = True
+
+    def __init__(self, share: Tensor, mass: Tensor, offset: Tensor, target: Tensor, frame: SimFrame) -> None:
+        super().__init__()
+        self.register_buffer("held", share * mass)
+        self.register_buffer("offset", offset)
+        self.register_buffer("target", target.clone())
+        self.held: Tensor
+        self.offset: Tensor
+        self.target: Tensor
+        self._frame = frame
+
+    @classmethod
+    def at(cls, scene: SimulatedScene, state: State, place: Sequence[float]) -> Pull:
+        """Make a pull on the particles around a place.
+
+        Args:
+            scene: The simulated scene.
+            state: Its state now.
+            place: The place [scene units].
+        """
+        position, mass = state.position.detach(), scene.points.mass
+        centre = scene.frame.point_to_sim(torch.tensor(list(place), dtype=torch.float64)).to(position)
+        reach = REACH * scene.size * scene.frame.metres_per_unit
+        distance = torch.linalg.vector_norm(position - centre, dim=-1)
+        reach = max(reach, 1.5 * float(distance.amin()))
+        share = torch.exp(-((2 * distance / reach) ** 2)).where(distance < reach, 0.0)
+        held = share * mass
+        mean = (held[:, None] * position).sum(0) / held.sum()
+        return cls(share, mass, position - mean, mean, scene.frame)
+
+    def aim(self, place: Sequence[float]) -> None:
+        """Set where it pulls to [scene units]."""
+        target = self._frame.point_to_sim(torch.tensor(list(place), dtype=torch.float64))
+        self.target.copy_(target.to(self.target))
+
+    def forward(self, state: State) -> tuple[Tensor, Tensor]:
+        """Force [N], shape (P, 3), and resistance [kg/s], shape (P,)."""
+        away = self.target + self.offset - state.position
+        pull = QUICK**2 * away
+        size = torch.linalg.vector_norm(pull, dim=-1, keepdim=True)
+        pull = pull * (STRONGEST / size.clamp(min=STRONGEST))
+        damping = 2 * QUICK * self.held
+        return self.held[:, None] * pull - damping[:, None] * state.velocity, damping
+
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
@@ -426,3 +577,121 @@ def _drawn_roughly(simulation: Simulation) -> Simulation:
     """A simulation of which a renderer on a CPU thins Gaussians that are much smaller than a pixel."""
     simulation.painter.renderer = make_renderer(simulation.device, detail=DETAIL)
     return simulation
+
+
+if TYPE_CHECKING:
+    from jsonargparse import ArgumentParser, Namespace
+
+HEADROOM = 1.25  # x real time, so that the page can be drawn and the material stiffen
+MARGIN = 1.2  # a grid is tried that should be so many times faster still: a trial is short, and its time not exact
+TRIALS = 2  # of other grids than the configured one
+CLOSE = 0.1  # another trial on a grid that is so close would tell nothing
+BUDGET = 0.5  # s; for the frames of a trial
+SURFACE = 3.0  # power of 1 / dx with which the time grows for a surface
+MOTION = 2.0  # s of motion whose cost is estimated
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """A grid for the live page.
+
+    Attributes:
+        settings: The settings with it.
+        simulation: Their simulation.
+        sentence: What was chosen, and how to get the configured grid.
+    """
+
+    settings: Namespace
+    simulation: Simulation
+    sentence: str
+
+
+def in_real_time(parser: ArgumentParser, settings: Namespace, simulation: Simulation) -> Choice:
+    """Choose the finest grid, not finer than the configured one, on which this machine keeps up with real time.
+
+    Args:
+        parser: From :meth:`Simulation.parser`.
+        settings: The settings as they were configured.
+        simulation: Their simulation.
+    """
+    configured = float(settings.solver.dx)
+    made = {configured: (settings, simulation)}
+    frames = 1 + max(1, round(MOTION / simulation.frame_dt))
+
+    def measure(dx: float) -> Cost:
+        if dx not in made:
+            changed = changed_settings(parser, settings, {"solver.dx": dx})
+            made[dx] = changed, Simulation.from_settings(parser, changed)
+        cost = estimate_cost(made[dx][1], frames, budget=BUDGET, pictures=False)
+        return replace(cost, startup_seconds=0.0, dx=dx)
+
+    seconds, scene = (frames - 1) * simulation.frame_dt, simulation.scene
+    coarsest = suggest_spacing(scene.size * scene.frame.metres_per_unit, 0.0, QUALITIES["draft"])
+    first, found = finest_in_real_time(measure, seconds, configured, coarsest)
+    speeds = seconds / first.total_seconds, seconds / found.total_seconds
+    return Choice(*made[found.dx], sentence(configured, found.dx, *speeds))
+
+
+def finest_in_real_time(
+    measure: Callable[[float], Cost], seconds: float, configured: float, coarsest: float
+) -> tuple[Cost, Cost]:
+    """The cost on the configured grid, and on the finest one that is :data:`HEADROOM` times as fast as real time.
+
+    If none of those tried is so fast, the second is the fastest.
+
+    Args:
+        measure: Function that estimates the cost for a grid spacing [m]; called for few.
+        seconds: Length of the motion whose cost it estimates [s].
+        configured: Smallest grid spacing [m].
+        coarsest: Largest grid spacing [m]; if it is less than ``configured``, that one is kept.
+    """
+    wish, first = seconds / HEADROOM, measure(configured)
+    if first.total_seconds <= wish or configured >= coarsest:
+        return first, first
+    tried = [first]
+    for _ in range(TRIALS):
+        dx = _predicted(tried, wish / MARGIN, configured, coarsest)
+        if any(dx == cost.dx or (cost.total_seconds <= wish and abs(dx / cost.dx - 1) < CLOSE) for cost in tried):
+            break
+        try:
+            tried.append(measure(dx))
+        except ValueError:  # too coarse for a pin, for example
+            coarsest = math.sqrt(configured * dx)
+    fitting = [cost for cost in tried if cost.total_seconds <= wish]
+    if fitting:
+        return first, min(fitting, key=lambda cost: cost.dx)
+    return first, min(tried, key=lambda cost: cost.total_seconds)
+
+
+def _predicted(tried: list[Cost], seconds: float, finest: float, coarsest: float) -> float:
+    """The finest grid spacing on which a motion should take at most some time [m], rounded up to two digits.
+
+    The time grows with a power of 1 / dx: that between the two grids nearest to the time, or the third of a surface.
+    """
+    near, *others = sorted(tried, key=lambda cost: abs(math.log(cost.total_seconds / seconds)))
+    power = SURFACE
+    if others and abs(math.log(others[0].dx / near.dx)) > CLOSE:
+        power = math.log(others[0].total_seconds / near.total_seconds) / math.log(near.dx / others[0].dx)
+    dx = near.dx * (near.total_seconds / seconds) ** (1 / min(max(power, 1.0), 4.0))
+    unit = 10.0 ** (math.floor(math.log10(dx)) - 1)
+    return min(max(float(f"{math.ceil(dx / unit - 1e-6) * unit:.2g}"), finest), coarsest)
+
+
+def sentence(configured: float, chosen: float, configured_speed: float, speed: float) -> str:
+    """Says which grid was chosen, and how to get the configured one.
+
+    Args:
+        configured: Its spacing [m].
+        chosen: Spacing of the grid that was chosen [m].
+        configured_speed: Simulated seconds per second on the configured grid.
+        speed: The same on the one that was chosen.
+    """
+    fast = f"predicted to run at {speed:.2g} x real time here"
+    if chosen == configured:
+        kept = f"The configured grid of {configured:g} m is kept, {fast}"
+        return f"{kept}." if speed >= 1 else f"{kept}; no coarser one that shows the object was found."
+    why = "" if speed >= 1 else ", the fastest one found"
+    return (
+        f"Chose a grid of {chosen:g} m{why}, {fast}, instead of the configured {configured:g} m "
+        f"({configured_speed:.2g} x): --grid configured, or Grid on the page, takes that one."
+    )

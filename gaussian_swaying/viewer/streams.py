@@ -1,26 +1,215 @@
-"""Connections to the browsers that draw a session themselves, and the program with which they do."""
+"""What goes to browsers: states of a film, brushes, and the streams that carry both."""
 
 from __future__ import annotations
 
 import asyncio
 import gzip
 import http
+import json
+import math
 import secrets
 import struct
 import threading
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.gaussians.parts import ROLES
-from gaussian_swaying.viewer.brushes import BRUSH, Brushes
-from gaussian_swaying.viewer.film.page import PAGE
+from gaussian_swaying.recording.nodes import split_far
+from gaussian_swaying.rendering.shading import DiffuseShader
+from gaussian_swaying.rendering.tints import by_role
+from gaussian_swaying.simulation.body import SimulatedScene
+from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.viewer.film.page import PAGE, message, pack_splats
+from gaussian_swaying.viewer.film.recorded import film_without_frames, look_of
 from gaussian_swaying.viewer.session import Snapshot
-from gaussian_swaying.viewer.states import OFF, colour_message, look_message, scene_message, state_message
+
+BRUSH = "/brush"  # path
+
+
+@dataclass(frozen=True)
+class BrushMove:
+    """A message of a browser about its brush.
+
+    Attributes:
+        kind: ``stroke`` for a piece of a stroke, ``part`` for a double click.
+        first: Whether a stroke begins with this piece.
+        path: Corners of its path in the window [pixels].
+        size: Width and height of the window [pixels].
+        fov: Vertical field of view [rad].
+        near: Nearest depth that is drawn, in the units of the scene.
+        matrix: From the axes of the browser's camera, y up and z backwards, to those of its scene, row by row.
+    """
+
+    kind: str
+    first: bool
+    path: list[list[float]]
+    size: tuple[int, int]
+    fov: float
+    near: float
+    matrix: list[list[float]]
+
+
+def brush_move(raw: str) -> BrushMove:
+    """The message of a browser about its brush, from JSON."""
+    told = json.loads(raw)
+    matrix = torch.tensor(told["matrix"], dtype=torch.float64).reshape(4, 4).T  # as WebGL has it
+    width, height = (round(side) for side in told["size"])
+    fov = math.radians(told["fov"])
+    return BrushMove(told["kind"], told["first"], told["path"], (width, height), fov, told["near"], matrix.tolist())
+
+
+class Brushes:
+    """The brushes of all browsers, which are switched on and off together.
+
+    Attributes:
+        take: Called with the key of a browser and what its brush did, in the thread of the connections, which it must
+            not keep waiting.
+    """
+
+    def __init__(self) -> None:
+        self.take: Callable[[str, BrushMove], None] = lambda key, move: None
+        self._told = json.dumps({"on": False})
+        self._open: dict[str, tuple[Any, asyncio.AbstractEventLoop]] = {}
+
+    def tell(self, on: bool, radius: float) -> None:
+        """Switch the brushes on or off.
+
+        Args:
+            on: Whether they paint.
+            radius: Radius of what they paint [pixels].
+        """
+        self._told = json.dumps({"on": on, "radius": radius})
+        for connection, loop in list(self._open.values()):
+            asyncio.run_coroutine_threadsafe(connection.send(self._told), loop)
+
+    def forget(self, key: str) -> None:
+        known = self._open.pop(key, None)
+        if known is not None:
+            asyncio.run_coroutine_threadsafe(known[0].close(), known[1])
+
+    async def serve(self, key: str, connection: Any) -> None:
+        """Listen to a browser until it is gone."""
+        from websockets.exceptions import ConnectionClosed
+
+        self.forget(key)
+        self._open[key] = connection, asyncio.get_running_loop()
+        try:
+            await connection.send(self._told)
+            while True:
+                move = brush_move(await connection.recv())
+                self.take(key, move)
+        except ConnectionClosed:
+            pass
+        finally:
+            if self._open.get(key, (None,))[0] is connection:
+                del self._open[key]
+
+
+def drawable(snapshot: Snapshot) -> bool:
+    """True if a browser can draw a snapshot: the Gaussians follow nodes, in a light that it knows."""
+    shader = snapshot.simulation.painter.shader
+    with _turn(snapshot.simulation):
+        has_nodes = snapshot.simulation.scene.follow.nodes(snapshot.state) is not None
+    return has_nodes and (shader is None or isinstance(shader, DiffuseShader))
+
+
+@torch.inference_mode()
+def scene_message(snapshot: Snapshot, turn: Tensor) -> bytes:
+    """The Gaussians at rest and the nodes that move them, as in a film.
+
+    Args:
+        snapshot: A snapshot of the scene; see :func:`drawable`.
+        turn: Rotation from the scene to the axes of the browser's camera, shape (3, 3), float64.
+    """
+    simulation = snapshot.simulation
+    with _turn(simulation):
+        film = film_without_frames(simulation, snapshot.state, "scene")
+        world = film_from(simulation.scene, turn)
+    moving, still = pack_splats(film, moving=True), pack_splats(film, moving=False)
+    sizes = {"moving": len(moving), "still": len(still)}
+    head = {"kind": "scene", "head": film.head, **sizes, "world": world.T.flatten().tolist()}
+    rest = film.order.astype("<u4").tobytes(), film.stencils.astype("<u4").tobytes()
+    return message(head, moving, still, *rest)
+
+
+def film_from(scene: SimulatedScene, turn: Tensor) -> Tensor:
+    """The transformation of places from the axes of the browser's camera to a film, shape (4, 4), float64.
+
+    A film has the object's longest side as its unit, z up and the object's centre as its origin.
+    """
+    corners = torch.cat([torch.zeros(1, 3), torch.eye(3)]).double()
+    size = scene.size * scene.frame.metres_per_unit
+    places = scene.frame.point_to_sim(corners @ turn.to(corners)).cpu() / size
+    found = torch.eye(4, dtype=torch.float64)
+    found[:3, 3] = places[0]
+    found[:3, :3] = (places[1:] - places[0]).T
+    return found
+
+
+def look_message(simulation: Simulation) -> bytes:
+    """Light and background, where they have changed since the scene."""
+    with _turn(simulation):
+        return message({"kind": "look", **look_of(simulation.painter)})
+
+
+@torch.inference_mode()
+def colour_message(simulation: Simulation, index: Tensor, roles: Tensor) -> bytes:
+    """Other colours of some Gaussians: their indices (uint32), and red, green and blue of each (uint8).
+
+    Args:
+        simulation: The simulation.
+        index: The Gaussians, shape (M,).
+        roles: Their roles, see :func:`~gaussian_swaying.rendering.tints.by_role`, shape (M,).
+    """
+    with _turn(simulation):
+        sh = simulation.scene.model.sh0.detach()
+        sh = sh[index.to(sh.device)]
+        own = sh_to_color(sh, torch.ones(len(sh), 3, device=sh.device)).clamp(0, 1)
+        bytes_of = (by_role(own, roles) * 255).round().to(torch.uint8).numpy(force=True).tobytes()
+    return message({"kind": "colours", "count": len(index)}, index.numpy().astype("<u4").tobytes(), bytes_of)
+
+
+@torch.inference_mode()
+def state_message(snapshot: Snapshot, ended: bool) -> bytes:
+    """The displacement of the nodes of a state: 6 bytes each, and 16 more for one that moved far.
+
+    Args:
+        snapshot: The snapshot.
+        ended: Whether no other state follows for now.
+    """
+    simulation, state = snapshot.simulation, snapshot.state
+    scene = simulation.scene
+    with _turn(simulation):
+        moved = scene.follow.nodal(state)
+        assert moved is not None
+        values = moved.float().numpy(force=True)
+    near, far = split_far(values, 0.5 * scene.size * scene.frame.metres_per_unit)
+    head = {
+        "kind": "state",
+        "motion": snapshot.motion,
+        "time": snapshot.health.time,
+        "nodes": len(near),
+        "ended": ended,
+    }
+    return message(head, near.astype("<f2").tobytes(), far.astype("<i4").tobytes())
+
+
+def _turn(simulation: Simulation) -> AbstractContextManager[None]:
+    """On a GPU the turn of the thread that reads it, as another may record a graph; a CPU does not have to wait."""
+    return simulation.turn if simulation.device.type == "cuda" else nullcontext()
+
+
+OFF = message({"kind": "off"})
+"""Says that the server draws from now on."""
+
 
 STATES, PROGRAM = "/states", "/player.js"  # paths
 TAGS = f'<script src="{PROGRAM}"></script><script>watchWind();</script>'

@@ -21,8 +21,8 @@ from gaussian_swaying.scenes.alocasia import AlocasiaScene
 from gaussian_swaying.scenes.flag_on_stand import FlagOnStandScene
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.viewer import real_time, scenes
-from gaussian_swaying.viewer.scenes import settings_of_splat
+from gaussian_swaying.viewer import controls
+from gaussian_swaying.viewer.controls import settings_of_splat
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +126,7 @@ def test_the_grid_is_chosen_for_real_time_unless_it_is_given(capsys, monkeypatch
     before = file.read_bytes()
     monkeypatch.setattr(live, "Page", FakePage)
     monkeypatch.setattr(live, "share_cores", lambda: None)
-    monkeypatch.setattr(real_time, "estimate_cost", cubed)
+    monkeypatch.setattr("gaussian_swaying.viewer.session.estimate_cost", cubed)
     assert live.main([str(file), "--no-browser", *options]) == 0
     session = FakePage.shown
     told = capsys.readouterr().out
@@ -178,7 +178,7 @@ def test_a_splat_has_the_wind_of_its_preview(tmp_path):
     splat = tmp_path / "flag.ply"
     export_cloud(splat, FlagOnStandScene(spacing=0.05).generate())
     parser = Simulation.parser()
-    live = scenes.settings_of_splat(parser, splat, torch.device("cpu"), tmp_path)
+    live = controls.settings_of_splat(parser, splat, torch.device("cpu"), tmp_path)
     assert preview([str(splat), "--output", str(tmp_path / "look"), "--device", "cpu"]) == 0
     starter = parser.parse_args(["--config", str(tmp_path / "look" / "starter.yaml")])
     turbulence = live.wind.effects[0]["init_args"]

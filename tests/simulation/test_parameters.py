@@ -21,8 +21,7 @@ from gaussian_swaying.simulation.model import Edit, in_settings, names, number, 
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep
 from gaussian_swaying.sweeps.run import grouped
-from gaussian_swaying.viewer.changes import changed_settings
-from gaussian_swaying.viewer.session import Session
+from gaussian_swaying.viewer.session import Session, changed_settings
 
 CONFIG = base(frames=3)
 CONFIG["solver"]["damping"] = 0.5

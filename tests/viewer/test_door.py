@@ -8,7 +8,7 @@ import pytest
 from shared import value_error
 
 pytest.importorskip("viser", reason="needs the extra [viewer]")
-from gaussian_swaying.viewer.door import Door, check_address
+from gaussian_swaying.viewer.screen import Door, check_address
 
 
 def _open(address, **headers):

@@ -17,10 +17,10 @@ from gaussian_swaying.gaussians.parts import ROLES, Part, Parts
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.viewer import painting as painting_module
-from gaussian_swaying.viewer.brushes import brush_move
-from gaussian_swaying.viewer.painting import ALIKE, JOINED, choices
+from gaussian_swaying.viewer import controls
+from gaussian_swaying.viewer.controls import ALIKE, JOINED, choices
 from gaussian_swaying.viewer.session import Session
+from gaussian_swaying.viewer.streams import brush_move
 
 SIZE = (400, 300)
 CAMERA = look_at_camera((0.6, -2.2, 0.3), (0.6, 0.0, 0.4), (0, 0, 1), 40.0, *SIZE, dtype=torch.float64)
@@ -348,7 +348,7 @@ def test_who_has_no_key_cannot_paint(page):
 def test_no_more_moves_wait_than_there_is_room_for(page, painter, monkeypatch):
     painting = page.controls.painting
     monkeypatch.setattr(page.turns, "ask", lambda key, what: None)
-    monkeypatch.setattr(painting_module, "MOST_WAITING", 3)
+    monkeypatch.setattr(controls, "MOST_WAITING", 3)
     move = brush_move(json.dumps(message(page._turn, [1, 2])))
     for _ in range(10):
         painting._came("a", move)

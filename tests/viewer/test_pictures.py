@@ -10,8 +10,7 @@ from shared import value_error
 
 from gaussian_swaying.geometry.rotations import rotation_to_quat
 from gaussian_swaying.simulation.draw import draw_wind
-from gaussian_swaying.viewer.film_strip import FilmStrip
-from gaussian_swaying.viewer.pictures import SHOWN, PictureSize, camera_of, draw, enlarged, under_cursor
+from gaussian_swaying.viewer.pictures import SHOWN, FilmStrip, PictureSize, camera_of, draw, enlarged, under_cursor
 
 
 def _pose(session):
@@ -124,7 +123,7 @@ def test_a_film_is_as_long_as_the_simulated_time():
 
 
 def test_a_film_ends_at_its_greatest_length(monkeypatch):
-    monkeypatch.setattr("gaussian_swaying.viewer.film_strip.LONGEST", 0.2)
+    monkeypatch.setattr("gaussian_swaying.viewer.pictures.LONGEST", 0.2)
     film = FilmStrip()
     picture = np.zeros((32, 48, 3), dtype=np.uint8)
     film.add(0.0, picture)

@@ -5,8 +5,8 @@ from shared import value_error
 from small_scenes import run_cost
 
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.viewer import real_time
-from gaussian_swaying.viewer.real_time import HEADROOM, finest_in_real_time, in_real_time, sentence
+from gaussian_swaying.viewer import session
+from gaussian_swaying.viewer.session import HEADROOM, finest_in_real_time, in_real_time, sentence
 
 CONFIGURED, COARSEST = 0.032, 0.075
 
@@ -102,12 +102,12 @@ def test_a_scene_gets_the_chosen_grid_and_its_settings_stay(parser, settings, mo
         seconds = 2.0 / 0.7 * (0.05 / simulation.solver.dx) ** 3
         return run_cost(simulation.solver.dx, simulation_seconds=seconds, startup_seconds=9.0)
 
-    monkeypatch.setattr(real_time, "estimate_cost", estimate)
+    monkeypatch.setattr(session, "estimate_cost", estimate)
     choice = in_real_time(parser, settings, Simulation.from_settings(parser, settings))
     assert settings.solver.dx == 0.05
     assert choice.settings.solver.dx == choice.simulation.solver.dx == 0.065
     assert choice.sentence.startswith("Chose a grid of 0.065 m, predicted to run at 1.5 x")
-    assert asked[0] == (0.05, 51, real_time.BUDGET, False)
+    assert asked[0] == (0.05, 51, session.BUDGET, False)
 
 
 def test_a_trial_of_a_flag_chooses_by_its_speed(parser, settings, monkeypatch):
@@ -116,11 +116,11 @@ def test_a_trial_of_a_flag_chooses_by_its_speed(parser, settings, monkeypatch):
     The flag is 1.2 m long, from the first Gaussian to the last a little less: at most 0.073 m, a sixteenth.
     """
     settings.solver.dx = 0.04
-    monkeypatch.setattr(real_time, "BUDGET", 0.05)
-    monkeypatch.setattr(real_time, "HEADROOM", 1e-6)
+    monkeypatch.setattr(session, "BUDGET", 0.05)
+    monkeypatch.setattr(session, "HEADROOM", 1e-6)
     simulation = Simulation.from_settings(parser, settings)
     kept = in_real_time(parser, settings, simulation)
     assert kept.simulation is simulation
     assert kept.settings is settings
-    monkeypatch.setattr(real_time, "HEADROOM", 1e6)
+    monkeypatch.setattr(session, "HEADROOM", 1e6)
     assert in_real_time(parser, settings, simulation).simulation.solver.dx == 0.073

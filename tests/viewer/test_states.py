@@ -16,7 +16,7 @@ from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.viewer.film.page import message, pack_splats
 from gaussian_swaying.viewer.film.recorded import film_without_frames
 from gaussian_swaying.viewer.session import Session
-from gaussian_swaying.viewer.states import (
+from gaussian_swaying.viewer.streams import (
     colour_message,
     drawable,
     film_from,

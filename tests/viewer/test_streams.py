@@ -17,8 +17,7 @@ from websockets.sync.client import connect as connect_socket
 
 from gaussian_swaying.gaussians.parts import ROLES
 from gaussian_swaying.viewer import streams
-from gaussian_swaying.viewer.states import scene_message
-from gaussian_swaying.viewer.streams import ANSWER
+from gaussian_swaying.viewer.streams import ANSWER, scene_message
 
 from .conftest import pause, pictures_since
 

@@ -4,7 +4,7 @@ import threading
 
 from browsers import until
 
-from gaussian_swaying.viewer.turns import Turns
+from gaussian_swaying.viewer.screen import Turns
 
 
 def test_what_is_asked_is_done_in_order_and_of_the_same_only_the_last():

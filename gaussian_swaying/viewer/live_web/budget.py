@@ -6,8 +6,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.viewer.changes import changed_settings
 from gaussian_swaying.viewer.live_web.block import check, in_webassembly
+from gaussian_swaying.viewer.session import changed_settings
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
