@@ -675,7 +675,7 @@ class WindForce(Force):
         Returns:
             Shape (steps, 3), or (steps, B, 1, 3) with one wind for each scene; float64, on the device of ``time``.
         """
-        times = time + torch.arange(steps, dtype=torch.float64, device=time.device) * dt
+        times = _times(time, dt, steps)
         at = times if self.places is None else times[:, None] - self.places.delay
         if len(self._fields) == 1:
             found = _blow(self._fields[0], at)
@@ -795,7 +795,7 @@ class WindForce(Force):
         wind = self._fields[0]
         if not (self._shared and isinstance(wind, WindField)):
             return super().during(time, dt, steps)
-        times = time + torch.arange(steps, dtype=torch.float64, device=time.device) * dt
+        times = _times(time, dt, steps)
         moments = list(map(Moment, times, wind.mean_flow(times), wind.carried(times)))
         blown = _blow(wind, times)
         return lambda state, k: self.force(state, wind.shaped(blown[k], state.position, moments[k]))
@@ -853,13 +853,15 @@ class WindForce(Force):
         """As :meth:`winds`, and the numbers of the device functions of the effects at these times, shape (steps, n)."""
         wind = self._fields[0]
         assert isinstance(wind, WindField)
-        times = time + torch.arange(steps, dtype=torch.float64, device=time.device) * dt
-        asked = [part.per_substep for part in parts if part.per_substep.count]
-        rows = [_blow(wind, times)]
-        if asked:
-            moment = Moment(times, wind.mean_flow(times), wind.carried(times))
-            rows += [torch.as_tensor(numbers.take(moment)) for numbers in asked]
-        return torch.cat(rows, dim=-1)
+        times = _times(time, dt, steps)
+        moment = Moment(times, wind.mean_flow(times), wind.carried(times))
+        own = [part.per_substep.take(moment) for part in parts if part.per_substep.count]
+        return torch.cat([_blow(wind, times), *map(torch.as_tensor, own)], dim=-1)
+
+
+def _times(time: Tensor, dt: float | Tensor, steps: int) -> Tensor:
+    """Times [s] at the start of ``steps`` substeps of ``dt`` [s]."""
+    return time + torch.arange(steps, dtype=torch.float64, device=time.device) * dt
 
 
 def _air(wind: nn.Module, time: Tensor, position: Tensor) -> Tensor:
