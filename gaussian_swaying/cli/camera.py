@@ -68,7 +68,7 @@ def write_camera(options: argparse.Namespace) -> int:
     """Find the camera, write the files, and print how sure it is."""
     from PIL import Image
 
-    from gaussian_swaying.fitting.registration import find_camera
+    from gaussian_swaying.fitting.cameras import find_camera
     from gaussian_swaying.gaussians.formats import read_gaussians
 
     if options.fov is not None and not 0 < options.fov < 180:
@@ -130,7 +130,7 @@ def first_cameras(
     cloud: GaussianCloud, up: Sequence[float] | None, fov: float, width: int, height: int
 ) -> list[Camera]:
     """Cameras around a splat, from which it fills the picture."""
-    from gaussian_swaying.fitting.registration import cameras_around
+    from gaussian_swaying.fitting.cameras import cameras_around
     from gaussian_swaying.gaussians.measures import Gaussians
     from gaussian_swaying.suggestion.up import guess_up
 

@@ -17,9 +17,17 @@ from gaussian_swaying import _program as program
 from gaussian_swaying._files import write_json, write_text
 from gaussian_swaying.cli.camera import CAMERAS, PICTURE, STILLS, VIEW, first_cameras, fov_of, painter_of, transforms
 from gaussian_swaying.cli.preview import keep_aside, up_of, write_starter
-from gaussian_swaying.fitting.film import Film, begins_to_move, first_frame, open_film, pixels_of_focal
-from gaussian_swaying.fitting.held import held_end, moving_box, moving_points
-from gaussian_swaying.fitting.scale import SCALE
+from gaussian_swaying.fitting.cameras import (
+    Film,
+    begins_to_move,
+    first_frame,
+    held_end,
+    moving_box,
+    moving_points,
+    open_film,
+    pixels_of_focal,
+)
+from gaussian_swaying.fitting.unknowns import SCALE
 from gaussian_swaying.fitting.videos import Footage, read_videos
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.hold import given_hold
@@ -143,7 +151,7 @@ def _length(given: Sequence[str] | None) -> tuple[str, float] | None:
 
 
 def _registered(options: argparse.Namespace, up: Sequence[float] | None) -> tuple[Seen, str]:
-    from gaussian_swaying.fitting.registration import find_camera
+    from gaussian_swaying.fitting.cameras import find_camera
     from gaussian_swaying.gaussians.formats import read_gaussians
 
     film = open_film(options.film)
@@ -180,7 +188,7 @@ def _direction(words: Sequence[str]) -> list[float]:
 def _write_registration(seen: Seen, folder: Path) -> None:
     import imageio.v3 as iio
 
-    from gaussian_swaying.fitting.before import side_by_side, titled
+    from gaussian_swaying.fitting.evidence import side_by_side, titled
 
     iio.imwrite(folder / PICTURE, titled(side_by_side(seen.frame, seen.picture.color, seen.picture.alpha)))
 

@@ -18,10 +18,9 @@ from gaussian_swaying.cli import fit_film
 from gaussian_swaying.cli.camera import painter_of
 from gaussian_swaying.cli.fit import main
 from gaussian_swaying.cli.fit_film import Seen, extent, longest_side, plan_text, upright_in
-from gaussian_swaying.fitting.before import HELD, MOVING
-from gaussian_swaying.fitting.film import first_frame, open_film
-from gaussian_swaying.fitting.plan import read_plan
-from gaussian_swaying.fitting.scale import SCALE
+from gaussian_swaying.fitting.cameras import first_frame, open_film
+from gaussian_swaying.fitting.evidence import HELD_TINT, MOVING
+from gaussian_swaying.fitting.unknowns import SCALE, read_plan
 from gaussian_swaying.fitting.videos import read_videos
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.recording.video import VideoEncoder
@@ -74,7 +73,7 @@ def test_the_pictures_before_the_fit(checked):
     rest = np.asarray(Image.open(checked / "result/before/rest_0.png")).astype(float)[22:]
     frame, _, splat, roles = np.split(rest, 4, axis=1)
     cloth = (np.abs(roles - 255 * np.array(MOVING)) < 30).all(-1)
-    held = (np.abs(roles - 255 * np.array(HELD)) < 30).all(-1)
+    held = (np.abs(roles - 255 * np.array(HELD_TINT)) < 30).all(-1)
     assert cloth.sum() > 5 * held.sum() > 0
     assert np.nonzero(held)[1].max() < np.nonzero(cloth)[1].mean()
     grey = [picture[cloth].mean(-1) for picture in (frame, splat)]

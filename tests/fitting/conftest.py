@@ -3,7 +3,7 @@
 import pytest
 
 from gaussian_swaying.fitting.fit import Fit, fit
-from gaussian_swaying.fitting.plan import Plan, read_unknown
+from gaussian_swaying.fitting.unknowns import Plan, read_unknown
 from gaussian_swaying.fitting.videos import read_videos
 from gaussian_swaying.simulation.simulation import Simulation
 

@@ -7,7 +7,7 @@ import torch
 from handheld_films import tripod, write_base
 from shared import value_error
 
-from gaussian_swaying.fitting.background import Background
+from gaussian_swaying.fitting.cameras import Background
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.rendering.cameras.camera import project
 from gaussian_swaying.scenes.procedural import GivenScene

@@ -10,10 +10,19 @@ from bench.problems.films import write_video
 from shared import near, peak, value_error
 from small_films import TRUTH, cameras, changed
 
-from gaussian_swaying.fitting.changing import KNOTS, WALK, changes_of, knots_of, prior_of, steady_share
-from gaussian_swaying.fitting.plan import Plan, read_plan
-from gaussian_swaying.fitting.unknowns import FILM_START, Unknown
-from gaussian_swaying.fitting.variants import states_of
+from gaussian_swaying.fitting.unknowns import (
+    FILM_START,
+    KNOTS,
+    WALK,
+    Plan,
+    Unknown,
+    changes_of,
+    knots_of,
+    prior_of,
+    read_plan,
+    states_of,
+    steady_share,
+)
 from gaussian_swaying.simulation.simulation import Simulation
 
 SPEED, AZIMUTH = Unknown("wind.speed", 2.0, 12.0, "log"), Unknown("wind.azimuth", -20.0, 100.0)

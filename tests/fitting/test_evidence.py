@@ -19,7 +19,7 @@ from gaussian_swaying.fitting.evidence import (
     scales_of,
 )
 from gaussian_swaying.fitting.tracks import Tracks
-from gaussian_swaying.fitting.variants import states_of
+from gaussian_swaying.fitting.unknowns import states_of
 from gaussian_swaying.fitting.videos import Footage, read_videos
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 

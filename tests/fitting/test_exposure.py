@@ -5,8 +5,7 @@ import torch
 from handheld_films import drift, tripod, write_base
 from shared import peak, seeded
 
-from gaussian_swaying.fitting.background import Background
-from gaussian_swaying.fitting.exposure import gain_of, gains, with_gains
+from gaussian_swaying.fitting.cameras import Background, gain_of, gains, with_gains
 from gaussian_swaying.fitting.videos import Footage
 from gaussian_swaying.simulation.simulation import Simulation
 

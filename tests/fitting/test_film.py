@@ -8,8 +8,8 @@ import pytest
 import torch
 from shared import value_error
 
-from gaussian_swaying.fitting import film as films
-from gaussian_swaying.fitting.film import begins_to_move, first_frame, open_film
+from gaussian_swaying.fitting import cameras as films
+from gaussian_swaying.fitting.cameras import begins_to_move, first_frame, open_film
 from gaussian_swaying.recording.video import VideoEncoder
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.rendering.protocol import RenderOutput

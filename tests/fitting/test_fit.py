@@ -9,9 +9,9 @@ import pytest
 from shared import double, value_error
 from small_films import TRUTH, changed
 
+from gaussian_swaying.fitting.evidence import HELD
 from gaussian_swaying.fitting.fit import GRIDS, ROUNDS, Course, run_fit
-from gaussian_swaying.fitting.held_out import HELD
-from gaussian_swaying.fitting.rivals import SHAKEN
+from gaussian_swaying.fitting.unknowns import SHAKEN
 from gaussian_swaying.fitting.videos import read_videos
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")

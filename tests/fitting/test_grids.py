@@ -6,9 +6,7 @@ import pytest
 import torch
 from small_films import changed
 
-from gaussian_swaying.fitting.evidence import PictureEvidence, TrackEvidence, compare
-from gaussian_swaying.fitting.grids import distrust, trusted
-from gaussian_swaying.fitting.held_out import NOISE
+from gaussian_swaying.fitting.evidence import NOISE, PictureEvidence, TrackEvidence, compare, distrust, trusted
 from gaussian_swaying.fitting.tracks import track
 from gaussian_swaying.fitting.videos import read_videos
 
@@ -39,7 +37,7 @@ def test_points_count_by_how_far_another_grid_moves_them(own, simulation, left):
 
 
 def test_a_grid_on_which_the_scene_diverges_says_nothing(simulation, left, monkeypatch):
-    from gaussian_swaying.fitting import grids
+    from gaussian_swaying.fitting import evidence as grids
 
     pixels = grids._pixels
     calls = []

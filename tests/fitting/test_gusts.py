@@ -6,9 +6,7 @@ import pytest
 import torch
 from shared import double, randn, seeded
 
-from gaussian_swaying.fitting.changing import changes_of
-from gaussian_swaying.fitting.gusts import gusts_of, spectrum
-from gaussian_swaying.fitting.unknowns import Unknown
+from gaussian_swaying.fitting.unknowns import Unknown, changes_of, gusts_of, spectrum
 
 MEAN, INTENSITY, SCALE, EVERY = 4.0, 0.2, 0.8, 0.375
 

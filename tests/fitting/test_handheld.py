@@ -11,11 +11,10 @@ from handheld_films import drift, off, tripod, write_base, write_film
 from shared import double, longest, value_error
 from small_films import TRUTH
 
-from gaussian_swaying.fitting import registration
-from gaussian_swaying.fitting.background import Background
+from gaussian_swaying.fitting import cameras as registration
+from gaussian_swaying.fitting.cameras import Background, _goes, follow_camera, moves_by, smooth, stands_still
+from gaussian_swaying.fitting.evidence import prepared
 from gaussian_swaying.fitting.fit import fit
-from gaussian_swaying.fitting.handheld import _goes, follow_camera, moves_by, smooth, stands_still
-from gaussian_swaying.fitting.prepared import prepared
 from gaussian_swaying.fitting.tracks import still_until, track
 from gaussian_swaying.fitting.videos import Footage, read_videos
 from gaussian_swaying.rendering.cameras.camera import look_at_camera, project

@@ -5,8 +5,7 @@ import torch
 from shared import double, randn, seeded, value_error
 
 from gaussian_swaying.fitting.evidence import Block, scales_of
-from gaussian_swaying.fitting.identifiability import check_apart, condition, directions
-from gaussian_swaying.fitting.least_squares import (
+from gaussian_swaying.fitting.fit import (
     NO_STEP,
     Progress,
     huber,
@@ -15,7 +14,7 @@ from gaussian_swaying.fitting.least_squares import (
     normal_equations,
     sensitivities,
 )
-from gaussian_swaying.fitting.unknowns import Unknown
+from gaussian_swaying.fitting.unknowns import Unknown, check_apart, condition, directions
 
 TIME = torch.linspace(0, 1, 60, dtype=torch.float64)
 FLOORS = {"tracks": 1e-6}

@@ -8,8 +8,8 @@ from shared import double, longest, near
 from small_films import cameras
 
 from gaussian_swaying import Simulation
-from gaussian_swaying.fitting import overlap
-from gaussian_swaying.fitting.overlap import Overlap, drawn_beside
+from gaussian_swaying.fitting import tracks as overlap
+from gaussian_swaying.fitting.tracks import Overlap, drawn_beside
 from gaussian_swaying.rendering.cameras.camera import project
 from gaussian_swaying.scenes.procedural import FlagScene
 

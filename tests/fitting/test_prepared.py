@@ -6,9 +6,9 @@ from bench.problems.films import shaken
 from handheld_films import drift, tripod, write_base, write_film
 from shared import peak, value_error
 
-from gaussian_swaying.fitting import prepared as module
-from gaussian_swaying.fitting.plan import read_plan
-from gaussian_swaying.fitting.prepared import Judged, prepared
+from gaussian_swaying.fitting import evidence as module
+from gaussian_swaying.fitting.evidence import Judged, prepared
+from gaussian_swaying.fitting.unknowns import read_plan
 from gaussian_swaying.fitting.videos import read_videos
 from gaussian_swaying.simulation.simulation import Simulation
 

@@ -7,8 +7,7 @@ import pytest
 import torch
 from small_films import TRUTH
 
-from gaussian_swaying.fitting.plan import read_unknown
-from gaussian_swaying.fitting.rivals import SCANNED, SHAKEN, apart_by, bent_alike, mirrored, rivals_of
+from gaussian_swaying.fitting.unknowns import SCANNED, SHAKEN, apart_by, bent_alike, mirrored, read_unknown, rivals_of
 from gaussian_swaying.simulation.model import flow_of
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")

@@ -7,9 +7,7 @@ from shared import merged, peak, value_error
 from small_films import changed
 
 from gaussian_swaying.fitting.report import scene_text
-from gaussian_swaying.fitting.scale import SCALE
-from gaussian_swaying.fitting.unknowns import Unknown, check_unknowns
-from gaussian_swaying.fitting.variants import states_of
+from gaussian_swaying.fitting.unknowns import SCALE, Unknown, check_unknowns, states_of
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.scenes.patches import box, to_cloud
 from gaussian_swaying.simulation.simulation import Simulation

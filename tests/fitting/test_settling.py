@@ -10,13 +10,14 @@ import torch
 from shared import double, peak
 
 from gaussian_swaying.fitting.evidence import Block
-from gaussian_swaying.fitting.fit import Fit, run_fit
-from gaussian_swaying.fitting.least_squares import (
+from gaussian_swaying.fitting.fit import (
     NO_STEP,
+    Fit,
     Progress,
     expected_gain,
     iterate,
     linearised,
+    run_fit,
     step_from,
     unsettled,
 )

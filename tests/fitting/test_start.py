@@ -12,8 +12,7 @@ from small_films import TRUTH
 from gaussian_swaying.fitting.evidence import TrackEvidence, compare, compare_starts
 from gaussian_swaying.fitting.fit import Course, Fit
 from gaussian_swaying.fitting.tracks import track
-from gaussian_swaying.fitting.unknowns import FILM_START
-from gaussian_swaying.fitting.variants import states_of
+from gaussian_swaying.fitting.unknowns import FILM_START, states_of
 from gaussian_swaying.fitting.videos import read_videos
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")

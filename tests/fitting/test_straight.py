@@ -7,8 +7,7 @@ import torch
 from shared import double, peak
 
 from gaussian_swaying.fitting.evidence import Block
-from gaussian_swaying.fitting.least_squares import REACH, Progress, iterate
-from gaussian_swaying.fitting.straight import straight
+from gaussian_swaying.fitting.fit import REACH, Progress, iterate, straight
 from gaussian_swaying.fitting.unknowns import Unknown
 
 SOUGHT = [

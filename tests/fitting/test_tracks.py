@@ -9,9 +9,8 @@ from handheld_films import photographed
 from small_films import changed
 
 from gaussian_swaying.fitting.evidence import TrackEvidence
-from gaussian_swaying.fitting.overlap import drawn_beside, window_of
-from gaussian_swaying.fitting.tracks import _inside, match, track
-from gaussian_swaying.fitting.variants import states_of
+from gaussian_swaying.fitting.tracks import _inside, drawn_beside, match, track, window_of
+from gaussian_swaying.fitting.unknowns import states_of
 from gaussian_swaying.fitting.videos import Footage, read_videos
 from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
 from gaussian_swaying.rendering.protocol import RenderOutput

@@ -11,7 +11,7 @@ import yaml
 from small_scenes import together
 
 from gaussian_swaying.cli.live import session_of
-from gaussian_swaying.fitting.variants import check_variants
+from gaussian_swaying.fitting.unknowns import check_variants
 from gaussian_swaying.gaussians.harmonics import rotate_sh, sh_to_color
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.geometry.regions import Box

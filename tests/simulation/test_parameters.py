@@ -9,10 +9,8 @@ import torch
 import yaml
 from small_films import base
 
-from gaussian_swaying.fitting.plan import read_plan
 from gaussian_swaying.fitting.report import scene_text
-from gaussian_swaying.fitting.unknowns import Unknown, check_unknowns
-from gaussian_swaying.fitting.variants import states_of
+from gaussian_swaying.fitting.unknowns import Unknown, check_unknowns, read_plan, states_of
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene

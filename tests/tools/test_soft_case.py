@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from gaussian_swaying import Simulation
-from gaussian_swaying.fitting.plan import read_plan
+from gaussian_swaying.fitting.unknowns import read_plan
 from gaussian_swaying.gaussians.ply import write_ply
 
 from .conftest import beside
