@@ -343,7 +343,7 @@ def unsettled(normal: Normal, place: Tensor, unknowns: Sequence[Unknown], ended:
         normal: The normal equations at the end.
         place: The values at the end, as shares of the ranges, shape (U,).
         unknowns: The unknowns.
-        ended: The reason why the last iterations ended, see :class:`~gaussian_swaying.fitting.least_squares.Progress`;
+        ended: The reason why the last iterations ended, see :class:`~gaussian_swaying.fitting.fit.Progress`;
             empty if their number ran out.
     """
     step = step_from(normal, place) - place
@@ -479,7 +479,7 @@ class Course:
         rivals: Where other starts ended, as shares, to be compared with the end.
         matched: Values (as shares) at which the current step began, and Gaussians were matched; empty before it.
         rounds: How often it went on from another end.
-        damping: See :class:`~gaussian_swaying.fitting.least_squares.Progress`.
+        damping: See :class:`~gaussian_swaying.fitting.fit.Progress`.
         iteration: Iterations done in this step.
         ended: The reason why the iterations of this step ended; empty if they did not.
         history: One row for each iteration.
@@ -511,7 +511,7 @@ class Fit:
         say: Called with a line for each thing that is done.
         on_grid: Makes the simulation with cells so many times as large, to know what the grid does to the values; None
             to leave that.
-        judged: What the background said of the videos, see :func:`~gaussian_swaying.fitting.prepared.prepared`.
+        judged: What the background said of the videos, see :func:`~gaussian_swaying.fitting.evidence.prepared`.
 
     Raises:
         ValueError: If the plan does not fit the simulation or the videos.
@@ -1124,7 +1124,7 @@ def run_fit(
     """Do a fit and write its folder: values.csv, result.json, scene.yaml and pictures.
 
     Args:
-        plan: From :func:`~gaussian_swaying.fitting.plan.read_plan`.
+        plan: From :func:`~gaussian_swaying.fitting.unknowns.read_plan`.
         output: The folder.
         resume: Continue the fit in it after its last iteration.
         device: ``auto``, ``cpu`` or ``cuda``.
@@ -1172,7 +1172,7 @@ def check_fit(plan: Plan, output: str | os.PathLike[str], *, device: str = "auto
     """Read all that a fit needs, and write the pictures that it writes before it starts.
 
     Args:
-        plan: From :func:`~gaussian_swaying.fitting.plan.read_plan`.
+        plan: From :func:`~gaussian_swaying.fitting.unknowns.read_plan`.
         output: The folder of the fit.
         device: ``auto``, ``cpu`` or ``cuda``.
         progress: Print what the videos say against the plan.
@@ -1233,7 +1233,7 @@ def fit(
         resume: Continue the fit in it.
         device: ``auto``, ``cpu`` or ``cuda``.
         progress: Print a line for each iteration.
-        settings: Further fields of :class:`~gaussian_swaying.fitting.plan.Plan`, such as ``known``, ``stages`` and
+        settings: Further fields of :class:`~gaussian_swaying.fitting.unknowns.Plan`, such as ``known``, ``stages`` and
             ``fit_share``.
 
     Returns:

@@ -72,7 +72,7 @@ FILM_START = "film.start"
 film begins. It is no number of the simulation."""
 
 CHANGES = ("wind.speed@", "wind.azimuth@")
-"""Begins of the names of the wind at a time of the film, see :mod:`~gaussian_swaying.fitting.changing`."""
+"""Begins of the names of the wind at a time of the film, see :mod:`~gaussian_swaying.fitting.unknowns`."""
 
 
 def is_change(name: str) -> bool:
@@ -87,7 +87,7 @@ class Unknown:
     Args:
         name: The option of ``sim``, such as ``material.E``; or ``wind.speed`` [m/s], ``wind.azimuth`` [degrees, from +x
             towards +y] and ``wind.elevation`` [degrees above the ground], which together are ``wind.flow``; or
-            :data:`FILM_START` [s], or :data:`~gaussian_swaying.fitting.scale.SCALE` [m].
+            :data:`FILM_START` [s], or :data:`~gaussian_swaying.fitting.unknowns.SCALE` [m].
         low: Smallest value.
         high: Largest value.
         scale: ``log`` or ``linear``.

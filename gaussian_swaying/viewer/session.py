@@ -302,7 +302,7 @@ class Session:
     def change(self, values: Mapping[str, Any]) -> None:
         """Change fields of the configuration, for example ``{"wind.flow": [4, 0, 0], "material.E": 2e4}``.
 
-        Some fields change in motion; for others the simulation is made anew, see :func:`.changes.take`.
+        Some fields change in motion; for others the simulation is made anew, see :func:`take`.
         """
         with self._wake:
             self._changes.update(values)
