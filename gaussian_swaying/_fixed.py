@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import inspect
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import is_dataclass
 from functools import wraps
 from itertools import count
@@ -45,14 +45,12 @@ class Fixed:
         assignable: Names that can.
         live_as: Where a simulation has it, for example ``wind``.
         of_a_file: Whether its annotations are what a file can say, and Python more.
-        live: The numbers of a force that may change between two frames, each a ``Live``.
     """
 
     __slots__ = ()
     assignable: tuple[str, ...] = ()
     live_as: str = ""
     of_a_file: bool = False
-    live: Mapping[str, Any] = {}
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -38,6 +38,7 @@ class Force(Component, nn.Module):
             tensors of the module, and must never make the host wait (no ``float(tensor)``, no ``if tensor``, no copy
             from the host). If it is False (the default), the host calls the force in every substep, which is slow on a
             GPU; in all other cases it makes no difference.
+        live: The numbers that may change between two frames, each a ``Live``.
 
     Example:
         >>> class Weight(Force):
@@ -46,6 +47,8 @@ class Force(Component, nn.Module):
         ...     def forward(self, state):
         ...         return 0.1 * state.position.new_tensor([0.0, 0.0, -9.8]).expand_as(state.position)
     """
+
+    live: Mapping[str, Any] = {}
 
     def forward(self, state: State) -> Given:
         """The force at the start of a substep: that of the nearest device function of the class and its bases.

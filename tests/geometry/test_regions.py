@@ -140,7 +140,7 @@ region:
     instantiate = getattr(parser, "instantiate", None) or parser.instantiate_classes
     regions = instantiate(config).region.regions
     assert [type(region) for region in regions] == [Box, Not, Sphere, Everything]
-    assert repr(regions[0]) == "Box(min=[-inf, -inf, 1.5], max=[1, 2, inf])"
+    assert repr(regions[0]) == "Box(min=[None, None, 1.5], max=[1, 2, None])"
 
 
 def test_selection_needs_both_region_and_opacity(device, dtype):
