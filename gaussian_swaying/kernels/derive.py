@@ -363,10 +363,6 @@ def _number(value: Any) -> bool:
     return isinstance(value, (bool, int, float))
 
 
-def _opposite(x: Any, y: Any) -> bool:
-    return isinstance(x, Symbol) and x.op == "*" and _key(x.args[0]) == _key(-1.0) and _same(x.args[1], y)
-
-
 def _zero(value: Any) -> bool:
     return _number(value) and value == 0
 

@@ -41,7 +41,7 @@ def test_the_camera_of_a_picture_and_its_field_of_view(flag, capsys):
     assert "points agree on the camera" in capsys.readouterr().out
     found = camera_from_transforms(flag / "out/transforms.json", 0)
     assert _off(found) < 0.5
-    assert float((found.position - CAMERA.position).norm()) < 0.02
+    assert (found.position - CAMERA.position).norm() < 0.02
     assert json.loads((flag / "out/transforms.json").read_text())["frames"][0]["file_path"] == "../first.png"
     assert Image.open(flag / "out/registration.png").size == (3 * 320, 240)
 

@@ -11,7 +11,7 @@ import torch
 import yaml
 from flag_film import TRUTH, camera_of, write_case
 from PIL import Image
-from shared import refused
+from shared import refused, seeded, value_error
 from small_scenes import guess
 
 from gaussian_swaying.cli import fit_film
@@ -65,7 +65,7 @@ def test_the_file_that_a_fit_reads(checked):
     assert video.size == (270, 480)
     assert len(video.times) == pytest.approx(30, abs=2)
     eye = camera_of(270, 480).position
-    assert float((video.cameras[0].position - eye).norm()) < 0.02 * float(eye.norm())
+    assert (video.cameras[0].position - eye).norm() < 0.02 * eye.norm()
 
 
 def test_the_pictures_before_the_fit(checked):
@@ -115,13 +115,13 @@ def test_known_lengths(seen):
      ("5:9", "two places"), ("5,5:9999,9", "is not on the splat")],
 )  # fmt: skip
 def test_lengths_of_nothing(seen, name, told):
-    with pytest.raises(ValueError, match=told):
+    with value_error(told):
         longest_side(name, 2.0, *seen)
 
 
 def test_the_extent_does_not_depend_on_the_turn():
     """A square cloth is as long as its side, however it is turned about the vertical, and not as its diagonal."""
-    share = torch.rand(4000, 2, generator=torch.Generator().manual_seed(0))
+    share = torch.rand(4000, 2, generator=seeded(0))
     for angle in (0.0, 0.5, 0.785):
         points = torch.stack([share[:, 0] * math.cos(angle), share[:, 0] * math.sin(angle), share[:, 1]], 1)
         assert extent(points, [0.0, 0.0, 1.0]) == pytest.approx(1.0, abs=0.01)

@@ -8,7 +8,7 @@ import urllib.request
 
 import pytest
 import torch
-from shared import refused
+from shared import refused, value_error
 from small_scenes import run_cost
 
 from gaussian_swaying.cli import live, scene
@@ -46,7 +46,7 @@ def test_options_of_this_command_are_not_shortened_and_there_is_one_scene(parser
     options, further = live.split(parser, ["--solver.dx=0.1", "--host", "::1"])
     assert (options.scene, options.host, further) == (None, "::1", ["--solver.dx=0.1"])
     assert live.split(parser, ["--po", "8081"])[1] == ["--po", "8081"]
-    with pytest.raises(ValueError, match=r"one SCENE, but got a\.ply and b\.ply"):
+    with value_error(r"one SCENE, but got a\.ply and b\.ply"):
         live.split(parser, ["a.ply", "--device", "cpu", "b.ply"])
 
 
@@ -65,7 +65,7 @@ def test_a_configuration_and_a_shipped_one(parser, tmp_path):
     assert config_text(parser, found) == config_text(
         parser, parser.parse_args(with_shipped(["--config=two_flags", *options], "sim"))
     )
-    with pytest.raises(ValueError, match="`SCENE` and `--config`"):
+    with value_error("`SCENE` and `--config`"):
         scene.settings_of(parser, "my.ply", ["--config", str(file)], tmp_path)
 
 

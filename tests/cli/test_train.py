@@ -14,7 +14,7 @@ import torch
 import yaml
 from damage import Fuse
 from lightning.pytorch.utilities.rank_zero import rank_zero_info, rank_zero_warn
-from shared import contents, words
+from shared import contents, value_error, words
 
 from gaussian_swaying.captures.generated_capture import GeneratedCapture
 from gaussian_swaying.cli.train import main, make_cli
@@ -266,7 +266,7 @@ def test_a_checkpoint_executes_no_code(command, capture, tmp_path, capsys):
     assert main([command, *_arguments(capture, tmp_path / "run"), f"--ckpt_path={file}"]) == 2
     assert "more than tensors, numbers and text" in capsys.readouterr().err
     cli = make_cli(_arguments(capture, tmp_path / "run"), run=False)
-    with pytest.raises(ValueError, match="more than tensors, numbers and text"):
+    with value_error("more than tensors, numbers and text"):
         getattr(cli.trainer, command)(cli.model, datamodule=cli.datamodule, ckpt_path=file)
     assert not burnt.exists()
     assert not (tmp_path / "run").exists()

@@ -6,11 +6,11 @@ import inspect
 import pytest
 import torch
 import yaml
+from shared import up_to
 
 import gaussian_swaying
 from gaussian_swaying import (
     AeroForce,
-    Box,
     Contact,
     Copy,
     Cylinder,
@@ -46,7 +46,7 @@ from gaussian_swaying.wind.computed_air import ComputedAir
 from gaussian_swaying.wind.tables import Shelter
 from gaussian_swaying.wind.turbulence import Turbulence
 
-POLE = Box([None] * 3, [0.11, None, None])
+POLE = up_to(x=0.11)
 FLAG = FlagScene(spacing=0.1)
 APART = {"CaptureDataModule", "SimulationDiverged", "SpatialWind", "SplatTrainer"}
 """An abstract class, an error, and those that Lightning assigns to."""

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from shared import double, near, up_to, value_error
 
 from gaussian_swaying import AeroForce, Box, Edit, Material, MPMSolver, PinnedRegion, Simulation, SineSway, WindField
 from gaussian_swaying.gaussians.formats import read_gaussians
@@ -18,10 +19,10 @@ DOUBLE = torch.float64
 def _simulation(values, edits=(), transfer="auto"):
     """A flag in a wind that meets it obliquely, with a fixed number of substeps."""
     given = VALUES | values
-    pin = PinnedRegion(Box([None, None, None], [0.11, None, None]))
+    pin = PinnedRegion(up_to(x=0.11))
     return Simulation(
         FlagScene(spacing=0.1),
-        solver=MPMSolver(dx=0.2, substep=4e-3, gravity=(0.0, 0.0, -1.0), boundaries=[pin], transfer=transfer),
+        solver=MPMSolver(0.2, substep=4e-3, gravity=(0.0, 0.0, -1.0), boundaries=[pin], transfer=transfer),
         wind=[1.0, given["wind"], 0.5],
         material=Material(**{name: given[name] for name in ("E", "nu", "density")}),
         aero=AeroForce(**{name: given[name] for name in ("C_D", "C_F", "C_L")}),
@@ -42,7 +43,7 @@ def _moved(values):
     """A sum over the flag that no symmetry makes insensitive to any of the values."""
     simulation = _simulation(values)
     moved = _end(simulation).position - simulation.scene.points.position
-    return (moved * torch.tensor([3.0, 1.0, 2.0], dtype=DOUBLE)).sum(-1).mean()
+    return (moved * double([3.0, 1.0, 2.0])).sum(-1).mean()
 
 
 def _leaf(value):
@@ -89,7 +90,7 @@ def test_a_rollout_in_parts_has_the_same_gradient():
         end = simulation.solver.rollout(simulation.start(), 4e-3, 10, simulation.forces, **options)
         end.position.square().sum().backward()
         found.append(torch.stack([leaf.grad for leaf in leaves.values()]))
-    assert bool((found[0] != 0).all())
+    assert (found[0] != 0).all()
     torch.testing.assert_close(*found, rtol=1e-10, atol=0.0)
 
 
@@ -131,15 +132,15 @@ def test_a_coefficient_that_is_zero_has_a_slope():
         (lambda: WindField(_leaf([1.0, 0.0])), "`flow` to have 3 numbers"),
         (lambda: SineSway(amplitude=_leaf(0.5)), "`amplitude` without a gradient"),
         (lambda: SineSway(phase=_leaf(0.5)), "`phase` without a gradient"),
-        (lambda: MPMSolver(dx=0.1, gravity=_leaf([0.0, 0.0, -9.8])), "`gravity` without a gradient"),
-        (lambda: MPMSolver(dx=0.1, damping=_leaf(1.0)), "`damping` without a gradient"),
-        (lambda: MPMSolver(dx=0.1, stiffness_damping=_leaf(1e-3)), "`stiffness_damping` without a gradient"),
+        (lambda: MPMSolver(0.1, gravity=_leaf([0.0, 0.0, -9.8])), "`gravity` without a gradient"),
+        (lambda: MPMSolver(0.1, damping=_leaf(1.0)), "`damping` without a gradient"),
+        (lambda: MPMSolver(0.1, stiffness_damping=_leaf(1e-3)), "`stiffness_damping` without a gradient"),
         (lambda: Edit(E=_leaf(1e4)), "`edits.E` without a gradient"),
         (lambda: _simulation({"E": _leaf(1e4)}, [Edit(density=10.0)]), "would lose the gradient of `material`"),
     ],
 )
 def test_a_gradient_that_would_be_lost_is_refused(make, words):
-    with pytest.raises(ValueError, match=words):
+    with value_error(words):
         make()
 
 
@@ -154,7 +155,5 @@ def test_a_frame_with_a_gradient_is_saved(suffix, tmp_path):
         *_, frame = _simulation(values).frames(2)
         frame.save(tmp_path / f"{name}{suffix}")
     found, wanted = (read_gaussians(tmp_path / f"{name}{suffix}") for name in ("with", "without"))
-    torch.testing.assert_close(
-        found.means, wanted.means, rtol=0, atol=1e-4
-    )  # kernels draw the frame without a gradient
-    torch.testing.assert_close(found.scales, wanted.scales, rtol=0, atol=1e-2)
+    near(found.means, wanted.means, 1e-4)  # kernels draw the frame without a gradient
+    near(found.scales, wanted.scales, 1e-2)

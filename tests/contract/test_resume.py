@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 import torch
+from shared import up_to
 
-from gaussian_swaying import Box, Copy, Edit, Material, PinnedRegion, Recorder, Simulation, WindField
+from gaussian_swaying import Copy, Edit, Material, PinnedRegion, Recorder, Simulation, WindField
 from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.mpm.laws.elastic import NeoHookean
@@ -18,7 +19,7 @@ from gaussian_swaying.wind.tables import Shelter
 from gaussian_swaying.wind.turbulence import Turbulence
 
 FLAG = FlagScene(spacing=0.1).generate()
-PIN = PinnedRegion(Box([None] * 3, [0.11, None, None]))
+PIN = PinnedRegion(up_to(x=0.11))
 STRIPS = torch.bucketize(FLAG.means[:, 0].contiguous(), torch.tensor([0.3, 0.7]))
 ROLES = [Part("pole", "held"), Part("cloth"), Part("board", "rigid")]
 FLOWS = MPMSolver(0.2, "updated", boundaries=[PIN])
@@ -27,12 +28,12 @@ CASES = {
     "modes": {
         "scene": SolidScene("box", size=2.0, spacing=0.2),
         "material": Material(E=1e6, density=300.0, thickness=0.1),
-        "solver": MPMSolver(0.4, "modes", boundaries=[PinnedRegion(Box([None] * 3, [None, None, 0.2]))]),
+        "solver": MPMSolver(0.4, "modes", boundaries=[PinnedRegion(up_to(z=0.2))]),
     },
     "plastic": {"solver": FLOWS, "material": Material(E=3e3, density=30.0, law=Sand())},
     "solid": {
         "scene": Scene(generator=SolidScene("ball", 0.6, 0.06, gaussians="shell"), filling=InteriorFilling()),
-        "solver": MPMSolver(0.12, boundaries=[PinnedRegion(Box([None] * 3, [None, None, -0.2]))]),
+        "solver": MPMSolver(0.12, boundaries=[PinnedRegion(up_to(z=-0.2))]),
     },
     "edits": {
         "edits": [

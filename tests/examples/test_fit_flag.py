@@ -39,8 +39,8 @@ def test_a_few_iterations_lead_towards_the_truth(tool):
 def test_noise_is_seeded_and_as_large_as_asked(tool):
     setup = tool.Setup(spacing=0.1, frames=2)
     plain, a, b, c = (tool.record(setup, noise=n, seed=s) for n, s in ((0.0, 0), (1e-3, 0), (1e-3, 0), (1e-3, 1)))
-    assert bool((a == b).all())
-    assert not bool((a == c).all())
+    assert (a == b).all()
+    assert not (a == c).all()
     assert float((a - plain).std()) == pytest.approx(1e-3, rel=0.2)
 
 

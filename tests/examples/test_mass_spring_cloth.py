@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from shared import refused
+from shared import near, peak, refused, up_to
 
-from gaussian_swaying import Box, PinnedRegion, Simulation
+from gaussian_swaying import PinnedRegion, Simulation
 from gaussian_swaying.cli.evaluate import main as evaluate
 from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.geometry.regions import Sphere
@@ -32,7 +32,7 @@ def cloth():
 
 @pytest.fixture
 def simulation(cloth):
-    pins = [PinnedRegion(Box([None, None, None], [0.06, None, None]))]
+    pins = [PinnedRegion(up_to(x=0.06))]
     return cloth.flag(cloth.MassSpringCloth(0.1, (0.0, 0.0, -2.0), boundaries=pins))
 
 
@@ -60,7 +60,7 @@ def test_a_run_is_resumed_bit_for_bit(cloth, simulation, tmp_path):
 
 def test_energy_is_kept_and_pins_hold(cloth):
     """Without wind and damping, what falls turns into motion and stretch, to the order of the substep."""
-    pins = [PinnedRegion(Box([None, None, None], [0.06, None, None]))]
+    pins = [PinnedRegion(up_to(x=0.06))]
     simulation = cloth.flag(cloth.MassSpringCloth(0.1, (0.0, 0.0, -2.0), boundaries=pins))
     simulation.wind = None
     simulation.aero = simulation.aero.__class__(air_density=0.0)
@@ -77,7 +77,7 @@ def test_energy_is_kept_and_pins_hold(cloth):
 def test_edits_and_parameters_reach_it(simulation):
     state = simulation.start()
     soft = simulation.edit(state, Edit(region=Sphere([1.0, 0.0, 0.5], 0.3), E=1e3))
-    assert float(simulation.solver.stiffness.amin()) < 1e-1 * float(simulation.solver.stiffness.amax())
+    assert simulation.solver.stiffness.amin() < 1e-1 * simulation.solver.stiffness.amax()
     state = simulation.start()
     simulation.change({"wind.speed": 5.0, "solver.damping": 4.0})
     assert simulation.solver.settings.damping == 4.0
@@ -98,7 +98,7 @@ def test_a_batch_moves_as_each_alone(simulation):
         state, _ = frame.finish()
         ends = [(member, member.stepper.launch(end, steps).finish()[0]) for member, end in ends]
     for k, (member, end) in enumerate(ends):
-        torch.testing.assert_close(state.scene(k).position, end.position, atol=1e-6, rtol=0)
+        near(state.scene(k).position, end.position, 1e-6)
         assert frame.each[k].kinetic == pytest.approx(float(member.solver.energies(end)["kinetic"]), rel=1e-4)
 
 
@@ -163,6 +163,6 @@ def test_the_live_page_moves_it(simulation, tmp_path):
     before = session.snapshot.state.position.clone()
     session._advance(single=True)
     assert session.problem is None
-    assert float((session.snapshot.state.position - before).abs().max()) > 0
+    assert peak(session.snapshot.state.position - before) > 0
     low, high = simulation.solver.domain(session.snapshot.state)
     assert all(a < b for a, b in zip(low, high, strict=True))

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from shared import rand, seeded
 
 from gaussian_swaying import Force, GaussianCloud, Simulation, write_ply
 from gaussian_swaying.gaussians.parts import Part, Parts
@@ -44,10 +45,10 @@ class Swirl(Force):
 
 def captured(folder):
     """The file of a capture: a pot on a string, y down, in units of its own, uneven, with faint and loose Gaussians."""
-    draw = torch.Generator().manual_seed(0)
+    draw = seeded(0)
 
     def random(*shape):
-        return torch.rand(*shape, generator=draw, dtype=torch.float64)
+        return rand(*shape, generator=draw)
 
     angle, height = 6.2832 * random(900), random(900)
     wide = torch.where(height < 0.6, 1.0, 0.15)

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from shared import in_both, without_waits
+from shared import beyond, in_both, without_waits
 
 from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.geometry.regions import Box, Cylinder, Everything, Not, Sphere, Union
+from gaussian_swaying.geometry.regions import Cylinder, Everything, Not, Sphere, Union
 from gaussian_swaying.mpm.colliders import EnclosingBox, Plane, VelocityBox
 from gaussian_swaying.mpm.pins import Handle, Impulse, PinnedRegion, SequentialRelease
 from gaussian_swaying.mpm.solver import MPMSolver
@@ -57,7 +57,7 @@ def test_a_step_never_makes_the_host_wait(formulation):
     points = MaterialPoints.create(
         frame.point_to_sim(scene), volume=1e-3, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3
     )
-    corner, ball, rod = Box([None, None, 0.8], [None] * 3), Sphere([0, 0, 0], 0.5), Cylinder([1, 1, 1], [1, 2, 0], 1, 1)
+    corner, ball, rod = beyond(z=0.8), Sphere([0, 0, 0], 0.5), Cylinder([1, 1, 1], [1, 2, 0], 1, 1)
     boundaries = [
         PinnedRegion(corner),
         Handle(corner, [0.1, 0, 0], [0, 0, 1], [0.5, 0.5, 0.5]),
@@ -67,8 +67,8 @@ def test_a_step_never_makes_the_host_wait(formulation):
         EnclosingBox([-2, -2, -2], [3, 3, 3]),
         *(VelocityBox(region, [0, 0, 0.1]) for region in (corner, ball, rod, Union([ball, rod]), Not(Everything()))),
     ]
-    solver = MPMSolver(dx=0.2, formulation=formulation, boundaries=boundaries)
+    solver = MPMSolver(0.2, formulation, boundaries=boundaries)
     state = solver.step(solver.init_state(points, frame=frame), 1e-4)
     with without_waits():
         end = solver.step(state, 1e-4, force=torch.zeros(500, 3, device="cuda"))
-    assert bool(torch.isfinite(end.position).all())
+    assert torch.isfinite(end.position).all()

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from shared import value_error
 
 from gaussian_swaying.runs.folder import MARKER, claim_folder, hold_folder
 from gaussian_swaying.runs.lock import LOCK, FolderLock, FolderLocked
@@ -80,7 +81,7 @@ def test_an_earlier_run_is_moved_aside_but_not_what_is_in_use(tmp_path, capsys):
     folder = tmp_path / "run"
     _claim(folder).release()
     (folder / "mine.ply").write_text("precious")
-    with pytest.raises(ValueError, match=r"because .*mine.ply is in it and is needed now: choose"):
+    with value_error(r"because .*mine.ply is in it and is needed now: choose"):
         _claim(folder, in_use=[folder / "mine.ply"])
     _claim(folder).release()
     assert (tmp_path / "run.1" / "mine.ply").read_text() == "precious"
@@ -105,10 +106,10 @@ def test_the_folder_one_is_in(tmp_path, monkeypatch, capsys):
     _claim(Path(".")).release()
     (folder / "mine.txt").write_text("precious")
     for place in (".", "../run", str(folder)):
-        with pytest.raises(ValueError, match=r"because you are in that folder: choose another, or start from another"):
+        with value_error(r"because you are in that folder: choose another, or start from another"):
             _claim(Path(place))
     monkeypatch.chdir(folder / "deep")
-    with pytest.raises(ValueError, match="you are in that folder"):
+    with value_error("you are in that folder"):
         _claim(Path(".."))
     assert sorted(path.name for path in folder.iterdir()) == ["deep", "mine.txt", MARKER]
     monkeypatch.chdir(tmp_path)
@@ -131,19 +132,19 @@ def test_a_link_is_followed_and_stays(tmp_path, capsys):
     assert str(disk / "flag.1") in capsys.readouterr().out
     link.unlink()
     link.symlink_to(link)
-    with pytest.raises(ValueError, match="cannot be written"):
+    with value_error("cannot be written"):
         _claim(link)
     assert link.is_symlink()
 
 
 def test_what_is_no_folder(tmp_path):
     (tmp_path / "file").write_text("precious")
-    with pytest.raises(ValueError, match=r"file cannot be written \(File exists\): choose another"):
+    with value_error(r"file cannot be written \(File exists\): choose another"):
         _claim(tmp_path / "file")
     (tmp_path / "link").symlink_to(tmp_path / "nothing")
     foreign = tmp_path / "foreign"
     foreign.mkdir()
     (foreign / "summary.json").symlink_to(tmp_path / "nothing")
-    with pytest.raises(ValueError, match=r"foreign contains summary.json of something else"):
+    with value_error(r"foreign contains summary.json of something else"):
         _claim(foreign, ["summary.json"])
     assert [path.name for path in foreign.iterdir()] == ["summary.json"]

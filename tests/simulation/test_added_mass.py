@@ -4,9 +4,8 @@ import math
 
 import pytest
 import torch
-from shared import advanced
+from shared import advanced, beyond, double, in_both, near, peak
 
-from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.simulation.body import Material
 from gaussian_swaying.simulation.model import Edit
@@ -27,21 +26,21 @@ def hanging(make_simulation):
     """A sheet that hangs from its upper edge; gravity is slanted, so that it starts to swing."""
 
     def make(aero, **settings):
-        top = PinnedRegion(Box([None, None, 0.69], [None, None, None]))
+        top = PinnedRegion(beyond(z=0.69))
         given = {"gravity": (0.0, 0.5, -9.8), "dtype": torch.float64, "material": STIFF, "wind": WindField()}
         return make_simulation(aero=aero, pinned=False, boundaries=[top], **(given | settings))
 
     return make
 
 
-@pytest.mark.parametrize("formulation", ["total", "updated"])
+@in_both
 def test_still_air_slows_a_hanging_sheet(formulation, hanging):
     """All forces are the same, so the motion is that without air, in slower time: by sqrt(sigma / (sigma + m))."""
     without = hanging(air(0.0), formulation=formulation)
     carrying = hanging(air(), formulation=formulation, frame_dt=0.04 / SLOWER)
     slow, fast = (advanced(simulation, 15)[0].position for simulation in (carrying, without))
-    assert float((fast - without.model.points.position).abs().amax()) > 0.02
-    torch.testing.assert_close(slow, fast, rtol=0, atol=1e-9)
+    assert peak(fast - without.model.points.position) > 0.02
+    near(slow, fast, 1e-9)
 
 
 def test_its_frequency_is_that_of_the_plate_with_its_air(hanging):
@@ -58,7 +57,7 @@ def test_its_frequency_is_that_of_the_plate_with_its_air(hanging):
 
 
 @pytest.mark.parametrize("transfer", ["torch", "kernels"])
-@pytest.mark.parametrize("formulation", ["total", "updated"])
+@in_both
 def test_a_sheet_falls_slower_as_it_has_to_move_air(formulation, transfer, make_simulation):
     """By g sigma / (sigma + m)."""
     simulation = make_simulation(
@@ -78,7 +77,7 @@ def test_energy_is_kept_in_still_air_without_drag(hanging):
         first = simulation.stepper.at_first(simulation.start()).read()
         logs.append([first, *advanced(simulation, 25)[1]])
     mass, position = without.model.points.mass, without.model.points.position
-    weight = mass[:, None] * torch.tensor([0.0, 0.5, -9.8], dtype=torch.float64)
+    weight = mass[:, None] * double([0.0, 0.5, -9.8])
     assert logs[1][0].potential == pytest.approx(-float((weight * position).sum()))
     for name in ("kinetic", "elastic", "potential"):
         ours, theirs = ([getattr(health, name) for health in log] for log in logs)
@@ -97,7 +96,7 @@ def test_the_air_that_is_lifted_is_no_work_of_the_wind(hanging):
     assert worst[1] < 0.6 * worst[0]
 
 
-@pytest.mark.parametrize("formulation", ["total", "updated"])
+@in_both
 def test_kernels_and_torch_agree(formulation, hanging):
     """In float64, with wind and gravity."""
     ends = []
@@ -106,7 +105,7 @@ def test_kernels_and_torch_agree(formulation, hanging):
         simulation = hanging(air(drag=0.5), wind=wind, transfer=transfer, formulation=formulation)
         state, log = advanced(simulation, 5)
         ends.append((state.position, log[-1]))
-    torch.testing.assert_close(ends[0][0], ends[1][0], rtol=0, atol=1e-10)
+    near(ends[0][0], ends[1][0], 1e-10)
     for name in ("kinetic", "potential", "wind_work"):
         assert getattr(ends[0][1], name) == pytest.approx(getattr(ends[1][1], name), rel=1e-7)
 
@@ -121,7 +120,7 @@ def test_a_batch_is_as_each_alone(hanging):
         state, health = batch.advance(state)
     assert health.potential == pytest.approx(sum(advanced(one, 3)[1][-1].potential for one in (first, other)))
     for k, one in enumerate((first, other)):
-        torch.testing.assert_close(state.scene(k).position, advanced(one, 3)[0].position, rtol=0, atol=1e-10)
+        near(state.scene(k).position, advanced(one, 3)[0].position, 1e-10)
 
 
 def test_a_changed_breadth_binds_again_and_another_coefficient_does_not(hanging):
@@ -170,13 +169,13 @@ def test_gradients_by_the_density_pass(hanging):
         simulation.change("material.density", density)
         return simulation.advance(state)[0].position[:, 1].mean()
 
-    density = torch.tensor(30.0, dtype=torch.float64, requires_grad=True)
+    density = double(30.0).requires_grad_()
     (slope,) = torch.autograd.grad(end(density), density)
     assert float(slope) == pytest.approx(float(end(30.1) - end(29.9)) / 0.2, rel=1e-3)
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("formulation", ["total", "updated"])
+@in_both
 def test_a_gpu_does_the_same_with_recorded_frames(formulation, hanging):
     """In float32, with another breadth from the third frame on."""
     if not torch.cuda.is_available():
@@ -189,7 +188,7 @@ def test_a_gpu_does_the_same_with_recorded_frames(formulation, hanging):
         simulation.change("aero.added_mass", 0.3)
         state, more = advanced(simulation, 4, state)
         found.append((state.position.cpu(), [*log, *more]))
-    torch.testing.assert_close(found[0][0], found[1][0], rtol=0, atol=1e-4)
+    near(found[0][0], found[1][0], 1e-4)
     largest = max(health.kinetic for health in found[0][1])
     for name in ("kinetic", "potential", "wind_work"):
         ours, theirs = ([getattr(health, name) for health in log] for _, log in found)

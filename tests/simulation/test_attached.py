@@ -4,11 +4,10 @@ import dataclasses
 
 import pytest
 import torch
-from shared import advanced
+from shared import advanced, double, longest, up_to, value_error
 from small_scenes import together
 
 from gaussian_swaying.gaussians.parts import Part, Parts
-from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
@@ -27,7 +26,7 @@ def two_flags(gap=GAP):
 
 
 def simulation(cloud, connected="surface", dx=DX, formulation="total", **scene):
-    edge = Box([None, None, None], [0.05, None, None])
+    edge = up_to(x=0.05)
     solver = MPMSolver(dx, formulation, boundaries=[PinnedRegion(edge)])
     return Simulation(
         Scene(generator=GivenScene(cloud), connected=connected, metres_per_unit=1.0, **scene),
@@ -54,10 +53,10 @@ def test_flags_closer_than_a_cell_move_as_alone(points, layers):
     glued, _ = ends(simulation(cloud, "grid", **how))
     alone, _ = ends(simulation(cloud.select(number == 0), "grid", **how))
     rest = cloud.means[number == 0]
-    far = (alone - rest).norm(dim=-1).amax()
+    far = longest(alone - rest)
     assert far > 0.02
-    assert (both[number == 0] - alone).norm(dim=-1).amax() < 0.02 * far
-    assert (glued[number == 0] - alone).norm(dim=-1).amax() > 0.05 * far
+    assert longest(both[number == 0] - alone) < 0.02 * far
+    assert longest(glued[number == 0] - alone) > 0.05 * far
 
 
 @pytest.mark.parametrize("points", ["grid", "gaussian"])
@@ -99,7 +98,7 @@ def test_pieces_of_a_cell_are_those_attached_within_it():
 def test_a_few_samples_beyond_a_border_are_grouped_across_it():
     """Cells end at halves: of 24 samples in a row along x, two lie beyond 1.5, and one on another piece."""
     row = torch.stack([torch.linspace(0.6, 1.54, 24), torch.ones(24), torch.ones(24)], 1).double()
-    place = torch.cat([row, torch.tensor([[1.6, 1.2, 1.0]], dtype=torch.float64)])
+    place = torch.cat([row, double([[1.6, 1.2, 1.0]])])
     pairs = torch.stack([torch.arange(23), torch.arange(1, 24)], 1)
     home, piece = homes(place, 1.0, pairs, pieces_in_cells(place, 1.0, pairs))
     beyond = (row[:, 0] > 1.5).nonzero()[:, 0].tolist()
@@ -118,7 +117,7 @@ def test_what_is_connected_within_each_node_lies_nowhere_apart():
 
 def test_it_needs_the_total_formulation():
     cloud, _ = two_flags()
-    with pytest.raises(ValueError, match=r"`scene.connected: surface` needs `solver.formulation: total`"):
+    with value_error(r"`scene.connected: surface` needs `solver.formulation: total`"):
         simulation(cloud, formulation="updated")
 
 

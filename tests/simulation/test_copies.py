@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from shared import beyond, double, in_both, near, peak, seeded, up_to, value_error
 from small_scenes import together
 
 from gaussian_swaying.cli.live import session_of
 from gaussian_swaying.fitting.unknowns import check_variants
 from gaussian_swaying.gaussians.harmonics import rotate_sh, sh_to_color
 from gaussian_swaying.gaussians.parts import Part, Parts
-from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.contact import Contact
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.pins import PinnedPoints, PinnedRegion
@@ -29,7 +29,7 @@ from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.wind.field import FlowKey, GaussianGust, SpatialWind, UniformGust, WindField
 from gaussian_swaying.wind.tables import Shelter
 
-POLE = Box([None, None, None], [0.11, None, None])
+POLE = up_to(x=0.11)
 AXIS = FlagScene(spacing=0.1).generate().means[0]  # the middle of the particles that POLE holds; only x and y count
 ROW = [Copy(), Copy([0.0, 1.5, 0.0], 90.0), Copy([0.5, 3.0, 0.2], 200.0, delay=0.1)]
 
@@ -55,7 +55,7 @@ class Push(Force):
 
 def _coloured(degree=1):
     """A flag of 96 Gaussians whose colours depend on the direction, and ten Gaussians far below that do not move."""
-    flag, draw = FlagScene(spacing=0.1).generate(), torch.Generator().manual_seed(0)
+    flag, draw = FlagScene(spacing=0.1).generate(), seeded(0)
     still = flag.select(torch.arange(96) < 10)
     both = together(flag, replace(still, means=still.means - torch.tensor([0.0, 0.0, 5.0])))
     more = 0.3 * (torch.rand(106, (degree + 1) ** 2 - 1, 3, generator=draw) - 0.5)
@@ -69,7 +69,7 @@ def _along(*borders):
 
 def _simulation(copies=(), wind=None, cloud=None, solver=None, scene=None, **more):
     solver = {"dx": 0.2, "boundaries": [PinnedRegion(POLE)], "gravity": (0.0, 0.0, 0.0)} | (solver or {})
-    scene = {"region": Box([None, None, -2.0], [None, None, None]), "points": "gaussian"} | (scene or {})
+    scene = {"region": beyond(z=-2.0), "points": "gaussian"} | (scene or {})
     settings = {"camera": OrbitCamera(width=48, height=27, azimuth=-70.0, radius=1.9), "device": "cpu"}
     return Simulation(
         Scene(generator=GivenScene(_coloured() if cloud is None else cloud), **scene),
@@ -88,7 +88,7 @@ def _end(simulation, frames=4):
 
 def _turn(degrees):
     s, c = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
-    return torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    return double([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _gusty(seed=5):
@@ -99,7 +99,7 @@ def _gusty(seed=5):
 
 
 @pytest.mark.parametrize("points", ["gaussian", "grid"])
-@pytest.mark.parametrize("formulation", ["total", "updated"])
+@in_both
 def test_a_copy_alone_is_the_object_to_the_bit(formulation, points):
     if points == "grid" and formulation == "updated":
         points = None
@@ -107,7 +107,7 @@ def test_a_copy_alone_is_the_object_to_the_bit(formulation, points):
     one, copy = (_end(_simulation(copies, **more)) for copies in ([], [Copy()]))
     assert torch.equal(copy.state.position[0], one.state.position)
     assert torch.equal(copy.render().color, one.render().color)
-    assert float((one.state.position - _simulation(**more).start().position).abs().max()) > 0.01
+    assert peak(one.state.position - _simulation(**more).start().position) > 0.01
 
 
 def test_all_take_the_substeps_of_the_fastest():
@@ -117,16 +117,16 @@ def test_all_take_the_substeps_of_the_fastest():
     both = _end(_simulation(copies, wind, **fixed)).state.position
     for own, flow in zip(both, ([6.0, 0.0, 0.0], [0.0, -6.0, 0.0]), strict=True):
         alone = _end(_simulation([], WindField(flow), **fixed)).state.position
-        torch.testing.assert_close(own, alone, rtol=0, atol=1e-9)
-    assert float((both[0] - both[1]).abs().max()) > 0.01
+        near(own, alone, 1e-9)
+    assert peak(both[0] - both[1]) > 0.01
     free = _end(_simulation(copies, wind)).state.position
-    torch.testing.assert_close(free.double(), both, rtol=0, atol=0.01)
+    near(free.double(), both, 0.01)
 
 
 @pytest.mark.parametrize("degrees", [37.0, 90.0, -120.0])
 def test_a_turned_copy_in_a_turned_wind_moves_alike(degrees):
     """Turned with the wind, it sees the same wind, and everything that is drawn is turned about its foot."""
-    flow = torch.tensor([6.0, 1.5, 0.4], dtype=torch.float64)
+    flow = double([6.0, 1.5, 0.4])
     one, other = (
         _end(
             _simulation(
@@ -137,14 +137,14 @@ def test_a_turned_copy_in_a_turned_wind_moves_alike(degrees):
         )
         for angle in (0.0, degrees)
     )
-    torch.testing.assert_close(other.state.position, one.state.position, rtol=0, atol=1e-9)
+    near(other.state.position, one.state.position, 1e-9)
     A, shift = _turn(degrees).float(), torch.tensor([0.3, 0.2, 0.1])
     a, b = one.gaussians, other.gaussians
     torch.testing.assert_close(b.means[:10], a.means[:10])  # what does not move
     moved = (a.means[10:] - AXIS - shift) @ A.T + AXIS + shift
-    torch.testing.assert_close(b.means[10:], moved, rtol=0, atol=1e-5)
-    torch.testing.assert_close(b.covariances[10:], A @ a.covariances[10:] @ A.T, rtol=0, atol=1e-6)
-    torch.testing.assert_close(b.normals[10:], a.normals[10:] @ A.T, rtol=0, atol=1e-5)
+    near(b.means[10:], moved, 1e-5)
+    near(b.covariances[10:], A @ a.covariances[10:] @ A.T, 1e-6)
+    near(b.normals[10:], a.normals[10:] @ A.T, 1e-5)
 
 
 def test_a_wind_that_varies_in_space_is_that_at_the_place():
@@ -153,8 +153,8 @@ def test_a_wind_that_varies_in_space_is_that_at_the_place():
     copies = _end(_simulation([Copy(), Copy([2.0, 0.0, 0.0])], Whirl(), **fixed)).state
     alone = [_end(_simulation([], Whirl((-x, 0.0)), **fixed)).state for x in (0.0, 2.0)]
     for k in (0, 1):
-        torch.testing.assert_close(copies.position[k], alone[k].position, rtol=0, atol=1e-12)
-    assert float((alone[0].position - alone[1].position).abs().max()) > 0.01
+        near(copies.position[k], alone[k].position, 1e-12)
+    assert peak(alone[0].position - alone[1].position) > 0.01
 
 
 def test_a_delay_is_the_same_wind_later():
@@ -163,8 +163,8 @@ def test_a_delay_is_the_same_wind_later():
     wind = WindField(schedule=keys, modulations=[UniformGust(0.5)], seed=2)
     frames = list(_simulation([Copy(), Copy(delay=0.08)], wind, solver={"substep": 0.002}, dtype="float64").frames(7))
     late = frames[6].state.position[1]
-    torch.testing.assert_close(late, frames[4].state.position[0], rtol=0, atol=1e-9)
-    assert float((late - frames[6].state.position[0]).abs().max()) > 0.01
+    near(late, frames[4].state.position[0], 1e-9)
+    assert peak(late - frames[6].state.position[0]) > 0.01
 
 
 def test_each_has_gusts_of_its_own():
@@ -173,7 +173,7 @@ def test_each_has_gusts_of_its_own():
     simulation = _simulation(copies, _gusty(5))
     assert simulation.stepper.wind_force.wind.seed.tolist() == [5, 6, 40, 5, 7]
     state = _end(simulation).state
-    assert float((state.position[0] - state.position[1]).abs().max()) > 0.001
+    assert peak(state.position[0] - state.position[1]) > 0.001
 
 
 def test_numbers_change_and_edits_act_on_all():
@@ -189,7 +189,7 @@ def test_numbers_change_and_edits_act_on_all():
     torch.testing.assert_close(red[10:], torch.tensor([1.0, 0.0, 0.0]).expand(3 * 96, 3))
     torch.testing.assert_close(red[:10], drawn[:10])
     simulation.wind = [0.0, 0.0, 0.0]
-    assert all(float(model.wind(torch.zeros(1)).abs().max()) == 0 for model in simulation.stepper.models)
+    assert all(float(peak(model.wind(torch.zeros(1)))) == 0 for model in simulation.stepper.models)
     other = _simulation(ROW)
     assert other.start().position.shape == (3, 96, 3)
     other.change("wind.speed", 1.0)
@@ -212,7 +212,7 @@ def test_the_axis_of_a_turn(hold, axis):
     """It goes through what the pins hold, or through the middle of an object that nothing holds."""
     simulation = _simulation([Copy(), Copy(turn=180.0)], solver={"boundaries": [hold] if hold else []})
     means = next(simulation.frames(1)).gaussians.means[10:].reshape(2, 96, 3)
-    torch.testing.assert_close((means[0] + means[1])[:, :2], (2 * axis[:2]).expand(96, 2), rtol=0, atol=0.02)
+    near((means[0] + means[1])[:, :2], (2 * axis[:2]).expand(96, 2), 0.02)
     torch.testing.assert_close(means[0, :, 2], means[1, :, 2])
 
 
@@ -220,21 +220,21 @@ def test_metres_and_the_up_direction_of_the_scene():
     """The shift is in metres along the axes of the wind; a turn keeps the height, wherever up is in the splat."""
     cloud = _coloured()
     cloud = replace(cloud, means=cloud.means[:, [0, 2, 1]] * torch.tensor([1.0, -1.0, 1.0]))
-    scene = {"up": [0.0, -1.0, 0.0], "metres_per_unit": 0.5, "region": Box([None] * 3, [None, 2.0, None])}
+    scene = {"up": [0.0, -1.0, 0.0], "metres_per_unit": 0.5, "region": up_to(y=2.0)}
     solver = {"dx": 0.1, "boundaries": []}
     simulation = _simulation([Copy([1.0, 2.0, 0.5]), Copy(turn=65.0)], cloud=cloud, scene=scene, solver=solver)
     frame, means = simulation.scene.frame, next(simulation.frames(1)).gaussians.means[10:].reshape(2, 96, 3)
     rest = simulation.scene.model.means[simulation.scene.moving]
     moved = frame.point_to_sim(means[0].double()) - frame.point_to_sim(rest.double())
-    torch.testing.assert_close(moved, torch.tensor([1.0, 2.0, 0.5]).double().expand(96, 3), rtol=0, atol=1e-5)
-    torch.testing.assert_close(means[1, :, 1], rest[:, 1], rtol=0, atol=1e-6)
-    assert float((means[1] - rest).abs().max()) > 0.4
+    near(moved, torch.tensor([1.0, 2.0, 0.5]).double().expand(96, 3), 1e-5)
+    near(means[1, :, 1], rest[:, 1], 1e-6)
+    assert peak(means[1] - rest) > 0.4
 
 
 # ---- pictures
 
 
-@pytest.mark.parametrize("formulation", ["total", "updated"])
+@in_both
 def test_a_rigid_part_is_a_body_of_each_copy(formulation):
     parts = Parts(_along(0.25, 0.75), [Part("pole", "held"), Part("cloth"), Part("board", "rigid", density=60.0)])
     more = {
@@ -244,12 +244,12 @@ def test_a_rigid_part_is_a_body_of_each_copy(formulation):
     }
     one = _end(_simulation([], **more)).state.position
     copies = _end(_simulation([Copy(), Copy([0.0, 2.0, 0.0], 60.0)], **more)).state.position
-    torch.testing.assert_close(copies[0], one, rtol=0, atol=1e-9)
+    near(copies[0], one, 1e-9)
     rest = _simulation([], **more).start().position
     board = rest[:, 0] > torch.quantile(rest[:, 0], 0.7)
     for own in copies:
-        torch.testing.assert_close(torch.pdist(own[board]), torch.pdist(rest[board]), rtol=0, atol=1e-9)
-    assert float((copies[0] - copies[1]).abs().max()) > 0.01
+        near(torch.pdist(own[board]), torch.pdist(rest[board]), 1e-9)
+    assert peak(copies[0] - copies[1]) > 0.01
 
 
 def test_a_held_part_belongs_to_the_copy_and_a_still_one_does_not():
@@ -265,14 +265,14 @@ def test_a_held_part_belongs_to_the_copy_and_a_still_one_does_not():
     assert torch.equal(copies.gaussians.means[:10], rest[96:])
     order = torch.cat([(labels == 1).nonzero()[:, 0], held.nonzero()[:, 0]])
     assert torch.equal(means[0, -int(held.sum()) :], rest[held])
-    torch.testing.assert_close(means[0], one.gaussians.means[order], rtol=0, atol=1e-3)
-    assert means[0, :72].sub(rest[labels == 1]).abs().max() > 0.01
+    near(means[0], one.gaussians.means[order], 1e-3)
+    assert peak(means[0, :72].sub(rest[labels == 1])) > 0.01
     middle = 0.5 * (rest[held].amin(0) + rest[held].amax(0))
     turned = (rest[held] - middle) * torch.tensor([-1.0, -1.0, 1.0]) + middle + torch.tensor([0.0, 2.0, 0.0])
-    torch.testing.assert_close(means[1, -int(held.sum()) :], turned, rtol=0, atol=1e-5)
+    near(means[1, -int(held.sum()) :], turned, 1e-5)
     view = turned - row.painter.camera_at(0).position
     seen = sh_to_color(rotate_sh(_coloured().sh[held], _turn(180.0).float()), view)
-    torch.testing.assert_close(colours[1, -int(held.sum()) :], seen, rtol=0, atol=2e-5)
+    near(colours[1, -int(held.sum()) :], seen, 2e-5)
 
 
 @pytest.mark.parametrize("shader", [None, DiffuseShader([0.3, -0.5, 0.8], two_sided=True, ambient=0.4, relative=True)])
@@ -286,7 +286,7 @@ def test_harmonics_turn_with_the_copy(shader):
     if shader is not None:
         normals = scene.model.normals()[:96]
         colours = shader(colours, normals @ _turn(90.0).float().T, rest_normal=normals)
-    torch.testing.assert_close(gaussians.colors[10:], colours, rtol=0, atol=2e-5)
+    near(gaussians.colors[10:], colours, 2e-5)
     torch.testing.assert_close(gaussians.colors[:10], sh_to_color(scene.model.sh[96:], view[:10]))
 
 
@@ -299,7 +299,7 @@ def test_the_camera_sees_all_of_them():
     row.painter.camera = LookAtCamera(eye=[0.5, 2.0, 0.4], target=[0.5, 4.0, 0.4], width=16, height=9)
     row.painter.check_camera(0)
     row.painter.camera = LookAtCamera(eye=[0.5, 4.0, 0.4], target=[0.5, 2.0, 0.4], width=16, height=9)
-    with pytest.raises(ValueError, match="lies inside the object"):
+    with value_error("lies inside the object"):
         row.painter.check_camera(0)
 
 
@@ -326,7 +326,7 @@ def test_from_a_configuration():
     assert simulation.stepper.copies.copies == (Copy([1.0, 0.0, 0.0], 90.0), Copy(delay=0.5), Copy())
     stored = yaml.safe_load(simulation.config)
     assert stored["copies"][0]["turn"] == 90
-    with pytest.raises(ValueError, match="live page shows one object: leave out `copies`"):
+    with value_error("live page shows one object: leave out `copies`"):
         session_of(parser, settings, real_time=False)
 
 
@@ -346,9 +346,9 @@ def test_on_a_gpu():
     for device in ("cpu", "cuda"):
         frames.append(_end(_simulation(ROW, _gusty(), device=device), 6))
     one, two = (frame.state.position.cpu() for frame in frames)
-    torch.testing.assert_close(two, one, rtol=0, atol=1e-4)
+    near(two, one, 1e-4)
     one, two = (frame.render().color.cpu() for frame in frames)
-    torch.testing.assert_close(two, one, rtol=0, atol=0.03)
+    near(two, one, 0.03)
 
 
 # ---- what is refused
@@ -365,7 +365,7 @@ def test_on_a_gpu():
     ids=["contact", "forces", "shelter", "gravity"],
 )
 def test_what_copies_cannot_have(changes, words):
-    with pytest.raises(ValueError, match=words):
+    with value_error(words):
         _simulation(ROW, **changes)
 
 
@@ -377,18 +377,18 @@ def test_what_copies_cannot_have(changes, words):
     ],
 )
 def test_what_is_not_recorded(options, words, tmp_path):
-    with pytest.raises(ValueError, match=words):
+    with value_error(words):
         _simulation(ROW).run(tmp_path / "out", 1, progress=False, recorder=Recorder(**options))
     assert not (tmp_path / "out").exists()
 
 
 def test_other_places_where_copies_are_refused(tmp_path):
     simulation = _simulation(ROW)
-    with pytest.raises(ValueError, match="`copies` cannot be written as a splat yet"):
+    with value_error("`copies` cannot be written as a splat yet"):
         next(simulation.frames(1)).save(tmp_path / "a.ply")
-    with pytest.raises(ValueError, match="they have `copies`, which are one already"):
+    with value_error("they have `copies`, which are one already"):
         simulation.batch([simulation.model])
-    with pytest.raises(ValueError, match="it has `copies`, and a video shows one object; remove them"):
+    with value_error("it has `copies`, and a video shows one object; remove them"):
         check_variants(simulation)
     assert list(tmp_path.iterdir()) == []
 

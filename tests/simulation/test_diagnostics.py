@@ -5,9 +5,8 @@ import math
 
 import pytest
 import torch
-from shared import waits
+from shared import double, in_both, rand, randn, seeded, up_to, waits
 
-from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.colliders import Plane
 from gaussian_swaying.mpm.laws.elastic import FixedCorotated
 from gaussian_swaying.mpm.laws.plastic import Sand
@@ -27,19 +26,19 @@ def _measured(*given, check=False, **more):
 
 
 def _solver(dtype=torch.float64):
-    position = torch.rand(30, 3, generator=torch.Generator().manual_seed(0), dtype=dtype)
+    position = torch.rand(30, 3, generator=seeded(0), dtype=dtype)
     points = MaterialPoints.create(position, volume=0.02, density=100.0, youngs_modulus=1e4, poisson_ratio=0.0)
-    solver = MPMSolver(dx=0.2, formulation="updated")
+    solver = MPMSolver(0.2, "updated")
     return solver, solver.init_state(points)
 
 
 def test_numbers_of_a_known_state():
     """Stretched by 2, 1, 0.25, moved by (3, 0, 4), all with velocity (0, 0, 2)."""
     solver, state = _solver()
-    F = torch.diag(torch.tensor([2.0, 1.0, 0.25], dtype=torch.float64)).expand(30, 3, 3)
-    shift = torch.tensor([3.0, 0.0, 4.0], dtype=torch.float64)
+    F = torch.diag(double([2.0, 1.0, 0.25])).expand(30, 3, 3)
+    shift = double([3.0, 0.0, 4.0])
     shift = shift * torch.linspace(0, 1, 30, dtype=torch.float64)[:, None]
-    velocity = torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64).expand(30, 3)
+    velocity = double([0.0, 0.0, 2.0]).expand(30, 3)
     lost = torch.zeros(30, dtype=torch.bool)
     lost[[3, 7]] = True
     start = state
@@ -49,8 +48,8 @@ def test_numbers_of_a_known_state():
         F_total=F,
         F_elastic=F,
         lost=lost,
-        time=torch.tensor(0.6, dtype=torch.float64),
-        work=torch.tensor(3.5, dtype=torch.float64),
+        time=double(0.6),
+        work=double(3.5),
     )
     health = _measured(solver, state, 12, solver.cfl_number(state, 1e-3), before=start)
     assert health.time == pytest.approx(0.6)
@@ -76,12 +75,12 @@ def test_numbers_of_a_known_state():
 
 def test_forces_on_supports(make_simulation):
     """The momentum that each boundary took in the frame over its time; a plane far away takes none."""
-    pin, plane = PinnedRegion(Box([None, None, None], [0.11, None, None])), Plane([0, 0, -9], [0, 0, 1])
+    pin, plane = PinnedRegion(up_to(x=0.11)), Plane([0, 0, -9], [0, 0, 1])
     simulation = make_simulation(pinned=False, boundaries=[pin, plane])
     before = simulation.start()
     after, health = simulation.advance(before)
     force = (after.impulse - before.impulse) / 0.04
-    torch.testing.assert_close(torch.tensor(health.support, dtype=torch.float64), force)
+    torch.testing.assert_close(double(health.support), force)
     assert health.support[1] == (0.0, 0.0, 0.0)
     assert health.support[0][2] < 0 < health.support[0][0]
     row = health.as_dict()
@@ -103,7 +102,7 @@ def test_extremes_are_those_of_single_particles():
 def test_extremes_of_a_batch_name_the_particles_of_their_scenes():
     """The third scene moved most, the second is compressed most, the first is stretched most."""
     alone, _ = _solver()
-    solver = MPMSolver(dx=alone.dx)
+    solver = MPMSolver(alone.dx)
     state = solver.init_state(MaterialPoints.stack([alone.points] * 3))
     F, position = state.F_total.clone(), state.position.clone()
     F[0, 4, 0, 0], F[2, 5, 0, 0] = 3.0, 2.0
@@ -117,10 +116,10 @@ def test_extremes_of_a_batch_name_the_particles_of_their_scenes():
 
 def _row(spacing=0.1, count=6, law=None):
     """Particles along x, one or two to a cell of 0.1 m."""
-    position = torch.zeros(count, 3, dtype=torch.float64)
+    position = torch.zeros(count, 3).double()
     position[:, 0] = torch.arange(count) * spacing
     points = MaterialPoints.create(position, volume=1e-3, density=1.0, youngs_modulus=1e3, poisson_ratio=0.3, law=law)
-    solver = MPMSolver(dx=0.1, formulation="updated")
+    solver = MPMSolver(0.1, "updated")
     return solver, solver.init_state(points)
 
 
@@ -134,17 +133,17 @@ def test_torn_particles_are_counted():
         # the two inner neighbours of the gap are 0.1 m apart at rest, so 0.2 m once the gap is 0.1 m
         assert int(gauge(state.position + shift).sum()) == torn, gap
         assert _measured(solver, state.replace(position=state.position + shift), 1, 1e-3, tearing=gauge).torn == torn
-    turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
-    assert not bool(gauge(state.position @ turn.T + 7.0).any())
+    turn = double([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    assert not gauge(state.position @ turn.T + 7.0).any()
 
 
 def test_what_was_apart_at_rest_or_flows_is_not_torn():
     solver, state = _row(spacing=0.25)
-    assert not bool(TearingGauge(solver)(state.position).any())
+    assert not TearingGauge(solver)(state.position).any()
     solver, state = _row(law=Sand())
-    assert not bool(TearingGauge(solver)(10 * state.position).any())
+    assert not TearingGauge(solver)(10 * state.position).any()
     solver, state = _row(law=FixedCorotated())
-    assert bool(TearingGauge(solver)(10 * state.position).all())
+    assert TearingGauge(solver)(10 * state.position).all()
 
 
 def _refused(solver, state, told):
@@ -171,7 +170,7 @@ def test_what_is_worst_is_named_first():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_one_bad_component_is_enough_and_the_first_particle_is_named(dtype):
     solver, state = _solver(dtype)
-    state = state.replace(time=torch.tensor(0.25, dtype=torch.float64))
+    state = state.replace(time=double(0.25))
     told = r"t = 0\.25 s, particle 17: .*NaN.*Remedy: lower `solver\.cfl`"
     for name, value in itertools.product(("position", "velocity", "F_elastic"), (math.nan, math.inf, -math.inf)):
         for column in range(getattr(state, name).flatten(1).shape[1]):
@@ -181,11 +180,11 @@ def test_one_bad_component_is_enough_and_the_first_particle_is_named(dtype):
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("formulation", ["total", "updated"])
+@in_both
 def test_a_frame_is_measured_in_one_transfer(formulation):
     position = torch.rand(200, 3, device="cuda")
     points = MaterialPoints.create(position, volume=0.02, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3)
-    solver = MPMSolver(dx=0.2, formulation=formulation)
+    solver = MPMSolver(0.2, formulation)
     state = solver.init_state(points)
     gauge, work = TearingGauge(solver), torch.zeros((), dtype=torch.float64, device="cuda")
     _measured(solver, state, 1, work, gauge, check=True)
@@ -194,15 +193,15 @@ def test_a_frame_is_measured_in_one_transfer(formulation):
 
 def test_numbers_of_a_batch_are_those_of_its_scenes():
     """Two scenes with states of their own; the work of the wind is what it did since the state before."""
-    draw = torch.Generator().manual_seed(0)
+    draw = seeded(0)
 
     def random(*shape):
-        return torch.randn(*shape, generator=draw, dtype=torch.float64)
+        return randn(*shape, generator=draw)
 
-    rest = torch.rand(30, 3, generator=draw, dtype=torch.float64)
+    rest = rand(30, 3, generator=draw)
     moved, velocity, F = 0.1 * random(2, 30, 3), random(2, 30, 3), torch.eye(3) + 0.1 * random(2, 30, 3, 3)
     lost = torch.rand(2, 30, generator=draw) < 0.2
-    done, work = random(2), torch.tensor([3.5, -1.25], dtype=torch.float64)
+    done, work = random(2), double([3.5, -1.25])
 
     def measurement(index):
         position = rest.expand(2, 30, 3)[index].clone()
@@ -213,7 +212,7 @@ def test_numbers_of_a_batch_are_those_of_its_scenes():
             youngs_modulus=1e4,
             poisson_ratio=0.3,
         )
-        solver = MPMSolver(dx=0.2, formulation="updated")
+        solver = MPMSolver(0.2, "updated")
         before = solver.init_state(points).replace(work=done[index])
         state = before.replace(
             position=position + moved[index],

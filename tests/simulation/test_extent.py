@@ -1,7 +1,7 @@
 """Sizes that make no sense are refused, odd ones are warned of."""
 
-import pytest
 import torch
+from shared import user_warning, value_error
 
 from gaussian_swaying.simulation.body import check_density, check_extent, coarse, narrow
 
@@ -20,18 +20,18 @@ def test_usual_objects_pass(recwarn):
 
 def test_a_stray_gaussian():
     stray = torch.cat([cube(), torch.tensor([[0.0, 1e10, 0.0]])])
-    with pytest.raises(ValueError, match=r"Gaussian 1000 lies at \[0.0, 10000000000.0, 0.0\].*`scene.region`"):
+    with value_error(r"Gaussian 1000 lies at \[0.0, 10000000000.0, 0.0\].*`scene.region`"):
         check_extent(stray, 1e-10, 0.05)
-    with pytest.raises(ValueError, match="Gaussian 7000 lies"):
+    with value_error("Gaussian 7000 lies"):
         check_extent(stray, 1e-10, 0.05, torch.arange(1001) * 7)
-    with pytest.warns(UserWarning, match="Gaussian 1000 lies at"):
+    with user_warning("Gaussian 1000 lies at"):
         check_extent(torch.cat([cube(), torch.tensor([[40.0, 0.0, 0.0]])]), 1.0, 0.05)
 
 
 def test_an_object_smaller_than_the_grid():
-    with pytest.raises(ValueError, match=r"0\.00\d+ cells of `solver.dx` = 1000 m.*lower `solver.dx` to about 0.042"):
+    with value_error(r"0\.00\d+ cells of `solver.dx` = 1000 m.*lower `solver.dx` to about 0.042"):
         check_extent(cube(), 1.0, 1000.0)
-    with pytest.warns(UserWarning, match="2 cells of `solver.dx` = 0.5 m"):
+    with user_warning("2 cells of `solver.dx` = 0.5 m"):
         check_extent(cube(), 1.0, 0.5)
 
 
@@ -61,5 +61,5 @@ def test_a_grid_too_fine_for_the_gaussians(recwarn):
     check_density(sheet, 1.0, 0.2)
     check_density(sheet[:8], 1.0, 0.1)  # so few may be meant so
     assert not recwarn.list
-    with pytest.warns(UserWarning, match=r"0.1 m apart, 1 cells.*raise `solver.dx` to about 0.2 m"):
+    with user_warning(r"0.1 m apart, 1 cells.*raise `solver.dx` to about 0.2 m"):
         check_density(sheet, 1.0, 0.1)

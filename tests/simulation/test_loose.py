@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 import torch
-from shared import advanced
+from shared import advanced, near, seeded
 from small_scenes import together
 
 from gaussian_swaying.mpm.solver import MPMSolver
@@ -18,7 +18,7 @@ def speckled():
     """A flag of 0.04 m between Gaussians, with two clumps of six 0.4 m in front of it."""
     flag = FlagScene(spacing=0.04).generate()
     own = flag.select(torch.tensor([300] * 6 + [420] * 6))
-    jitter = 0.01 * torch.rand(12, 3, generator=torch.Generator().manual_seed(0))
+    jitter = 0.01 * torch.rand(12, 3, generator=seeded(0))
     specks = dataclasses.replace(own, means=own.means + jitter - torch.tensor([0.0, 0.4, 0.0]))
     return together(flag, specks)
 
@@ -30,7 +30,7 @@ def test_specks_are_carried_and_weigh_nothing(points, make_scene):
     alone = make_scene(cloud.select(torch.arange(FLAG)), dx=0.1, points=points)
     specks = torch.arange(FLAG, FLAG + 12)
     assert scene.loose == 12
-    assert bool(torch.isin(specks, scene.carried).all())
+    assert torch.isin(specks, scene.carried).all()
     assert torch.equal(scene.simulated, torch.arange(FLAG))
     assert scene.points.count == alone.points.count
     assert float(scene.points.mass.sum()) == pytest.approx(float(alone.points.mass.sum()), rel=1e-5)
@@ -44,7 +44,7 @@ def test_specks_are_carried_and_weigh_nothing(points, make_scene):
 @pytest.mark.parametrize("points", POINTS)
 def test_they_go_where_their_neighbours_take_them(points, make_scene):
     scene = make_scene(speckled(), dx=0.1, points=points, loose="carry")
-    state = MPMSolver(dx=0.1).init_state(scene.points)
+    state = MPMSolver(0.1).init_state(scene.points)
     assert torch.equal(scene.deformed(state).means, scene.rest().means)
     F = torch.tensor([[1.1, 0.2, 0.0], [0.0, 0.9, 0.3], [-0.1, 0.0, 1.0]])
     nodes = state.grid.node_positions(F)
@@ -52,7 +52,7 @@ def test_they_go_where_their_neighbours_take_them(points, make_scene):
         position=state.position @ F.T, F_total=F.expand_as(state.F_total), node_displacement=nodes @ F.T - nodes
     )
     expected = scene.frame.point_to_scene(scene.frame.point_to_sim(scene.model.means.double()) @ F.double().T)
-    torch.testing.assert_close(scene.deformed(moved).means.double(), expected, atol=1e-5, rtol=0)
+    near(scene.deformed(moved).means.double(), expected, 1e-5)
 
 
 @pytest.mark.slow(gate=["grid"])
@@ -65,9 +65,9 @@ def test_the_wind_blows_specks_away_unless_they_are_carried(points, make_simulat
             state, _ = advanced(simulation, 12)
             moved[loose] = (simulation.scene.deformed(state).means - simulation.scene.rest().means).norm(dim=-1)
     flag, specks = moved["simulate"][:FLAG], moved["simulate"][FLAG:]
-    assert float(specks.min()) > 2 * float(flag.max())
+    assert specks.min() > 2 * flag.max()
     flag, specks = moved["carry"][:FLAG], moved["carry"][FLAG:]
-    assert float(specks.max()) < 1.5 * float(flag.max())
+    assert specks.max() < 1.5 * flag.max()
 
 
 def test_what_further_points_join_is_not_loose(make_scene):

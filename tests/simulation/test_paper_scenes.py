@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from shared import double
 
 from gaussian_swaying.cli.simulate import output_folder
 from gaussian_swaying.simulation.simulation import Simulation
@@ -60,7 +61,7 @@ def test_the_numbers_are_the_papers(name):
 def test_the_wind_of_the_vase_turns():
     parser = Simulation.parser()
     wind = parser.instantiate(parser.parse_args(files("vase"))).wind
-    assert [wind.mean_flow(torch.tensor(t, dtype=torch.float64)).tolist() for t in (0.0, 9.0)] == [
+    assert [wind.mean_flow(double(t)).tolist() for t in (0.0, 9.0)] == [
         [-1.5, 0, 0],
         [1.5, 0, 0],
     ]

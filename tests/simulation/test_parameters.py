@@ -7,11 +7,11 @@ import sys
 import pytest
 import torch
 import yaml
+from shared import beyond, double, peak, up_to, value_error
 from small_films import base
 
 from gaussian_swaying.fitting.report import scene_text
 from gaussian_swaying.fitting.unknowns import Unknown, check_unknowns, read_plan, states_of
-from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.body import Material, Scene
@@ -121,8 +121,8 @@ def test_what_is_out_of_range_or_not_there_is_refused_and_nothing_changes(name, 
 @pytest.mark.parametrize("name", ["material.E", "material.nu"])
 def test_what_says_where_the_layers_lie_is_not_changed(name):
     scene = Scene(generator=FlagScene(0.4, 0.3, 0.05), metres_per_unit=1.0, layers=3)
-    model = Simulation(scene, Material(E=1e4, bending=1e-4), solver=MPMSolver(dx=0.1), device="cpu").model
-    with pytest.raises(ValueError, match=f"`{name}` is to change, but with `material.bending`"):
+    model = Simulation(scene, Material(E=1e4, bending=1e-4), solver=MPMSolver(0.1), device="cpu").model
+    with value_error(f"`{name}` is to change, but with `material.bending`"):
         model.at({name: 0.2})
 
 
@@ -131,7 +131,7 @@ def test_a_plate_of_one_layer_stiffens_with_what_changes():
     scene = Scene(generator=FlagScene(0.4, 0.3, 0.05), metres_per_unit=1.0)
     changes = {"material.E": 3e4, "material.nu": 0.0, "material.thickness": 0.02}
     for bending, factor in (("plate", 3 * (1 - 0.3**2) * 2**3), (1e-4, 1.0)):
-        model = Simulation(scene, Material(E=1e4, bending=bending), solver=MPMSolver(dx=0.1), device="cpu").model
+        model = Simulation(scene, Material(E=1e4, bending=bending), solver=MPMSolver(0.1), device="cpu").model
         changed = model.at(changes)
         torch.testing.assert_close(changed.points.bending, factor * model.points.bending)
 
@@ -142,7 +142,7 @@ def test_material_that_a_region_gives_is_not_changed_everywhere(tmp_path):
     path = tmp_path / "regions.yaml"
     path.write_text(yaml.safe_dump(CONFIG | {"material": material}))
     model = Simulation.from_yaml(path, device="cpu").model
-    with pytest.raises(ValueError, match=r"material\.regions"):
+    with value_error(r"material\.regions"):
         model.at({"material.E": 1e3})
     assert model.at({"material.density": 30.0}).points is not model.points
 
@@ -150,18 +150,18 @@ def test_material_that_a_region_gives_is_not_changed_everywhere(tmp_path):
 @pytest.mark.parametrize("name", [name for name in NAMES if number(name).differentiable and name != "wind.flow"])
 def test_gradients_are_kept(name, config):
     model = Simulation.from_yaml(config, device="cpu").model
-    value = torch.tensor(model.value(name), dtype=torch.float64, requires_grad=True)
+    value = double(model.value(name)).requires_grad_()
     changed = model.at({name: value})
     points, aero = changed.points, changed.aero
     total = sum(part.double().sum() for part in (points.mass, points.volume, points.youngs_modulus))
     total = total + points.poisson_ratio.double().sum() + aero.C_D + aero.C_F + aero.C_L
     (slope,) = torch.autograd.grad(total, value)
-    assert float(slope.abs()) > 0
+    assert slope.abs() > 0
 
 
 def test_a_gradient_that_would_be_lost_is_refused(config):
     model = Simulation.from_yaml(config, device="cpu").model
-    with pytest.raises(ValueError, match="lose its gradient"):
+    with value_error("lose its gradient"):
         model.at({"wind.speed": torch.tensor(1.0, requires_grad=True)})
 
 
@@ -184,7 +184,7 @@ def test_a_number_of_a_users_force_is_live_without_a_parse(breath, parser, monke
     session._undo()
     assert session.simulation.custom_forces[0].strength == 0.1
     _close(session.simulation.model.value("material.E"), 1e4)
-    with pytest.raises(ValueError, match="from 0 to 9"):
+    with value_error("from 0 to 9"):
         changed_settings(parser, settings, {"forces.Breath.strength": 10.0})
 
 
@@ -199,11 +199,11 @@ def test_a_number_of_a_users_force_is_sought(breath, parser, tmp_path):
     check_unknowns(simulation, plan.unknowns)
     values = [{"forces.Breath.strength": 0.0}, {"forces.Breath.strength": 5.0}, {"wind.speed": 5.0}]
     weak, strong, same = [state.position for state in list(states_of(simulation, values, [0.0, 0.08]))[-1]]
-    assert float((strong - weak)[:, 2].mean()) > 1e-3
-    assert float((same - weak).abs().max()) > 0  # 0.1 by default
+    assert (strong - weak)[:, 2].mean() > 1e-3
+    assert peak(same - weak) > 0  # 0.1 by default
     text = scene_text({"forces.Breath.strength": 2.5}, parser, settings, simulation)
     assert yaml.safe_load(text)["forces"][0]["init_args"]["strength"] == 2.5
-    with pytest.raises(ValueError, match="range"):
+    with value_error("range"):
         Unknown("forces.Breath.strength", -1.0, 5.0)
 
 
@@ -215,7 +215,7 @@ def test_a_number_of_a_users_force_is_swept(breath, parser, tmp_path):
     assert sorted(found) == [0.2, 0.2, 0.4, 0.4]
     assert len(grouped(plan.runs, 8)) == 2  # runs that differ in the seed go together
     (tmp_path / "sweep.yaml").write_text(json.dumps({"base": str(breath), "axes": {"forces.Breath.strength": [99.0]}}))
-    with pytest.raises(ValueError, match="from 0 to 9"):
+    with value_error("from 0 to 9"):
         make_plan(read_sweep(tmp_path / "sweep.yaml"), parser)
 
 
@@ -239,12 +239,12 @@ def test_parameters_that_are_no_options_are_swept_too(backwards, config, parser,
 
 def test_a_variant_is_a_simulation_of_its_own(tmp_path):
     """As one that is made with these numbers, also after the first was started again, and with the same edits."""
-    edits = [Edit(region=Box([0.5, None, None], [None, None, None]), color=[1.0, 0.0, 0.0], detail=0.5)]
+    edits = [Edit(region=beyond(x=0.5), color=[1.0, 0.0, 0.0], detail=0.5)]
 
     def made(**material):
         return Simulation(
             FlagScene(spacing=0.1), Material(**material), wind=[4, 0, 0], edits=edits, device="cpu",
-            hold=Box([None, None, None], [0.11, None, None]),
+            hold=up_to(x=0.11),
         )  # fmt: skip
 
     first, expected = made(E=1e4, density=50.0), made(E=3e4, density=80.0)

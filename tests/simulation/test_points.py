@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from shared import advanced, unit
+from shared import advanced, beyond, peak, rand, randn, seeded, unit, up_to, value_error
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.filling import InteriorFilling
@@ -23,7 +23,7 @@ from gaussian_swaying.simulation.model import Edit
 from gaussian_swaying.wind.field import WindField
 from gaussian_swaying.wind.force import AeroForce, WindForce
 
-HALF = Box([0.0451, None, None], [None] * 3)
+HALF = beyond(x=0.0451)
 
 
 def fine_flag(spacing=0.02):
@@ -65,10 +65,10 @@ def test_mass_centre_volume_and_area_are_kept_by_few_points(per_cell, make_scene
 )
 def test_points_of_a_group_have_its_moments(sizes, count):
     """Mass, centre and covariance; as many points as the group has directions, two along each."""
-    generator = torch.Generator().manual_seed(0)
-    place = torch.randn(600, 3, generator=generator, dtype=torch.float64) * torch.tensor(sizes)
-    place = place @ torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64))[0]
-    mass = torch.rand(600, generator=generator, dtype=torch.float64)
+    generator = seeded(0)
+    place = randn(600, 3, generator=generator) * torch.tensor(sizes)
+    place = place @ torch.linalg.qr(randn(3, 3, generator=generator))[0]
+    mass = rand(600, generator=generator)
     group = torch.randint(0, 5, (600,), generator=generator)
     points, owner, of = matched_points(place, mass, group, torch.full((5,), True), 1.0)
     assert torch.equal(of[owner], group)
@@ -87,7 +87,7 @@ def test_points_of_a_group_have_its_moments(sizes, count):
 
 
 def test_points_of_a_full_cell_are_those_of_gauss():
-    axis = (torch.arange(40, dtype=torch.float64) + 0.5) / 40
+    axis = (torch.arange(40).double() + 0.5) / 40
     place = torch.cartesian_prod(axis, axis, axis[:1])
     points, _, _ = matched_points(
         place, torch.ones(1600), torch.zeros(1600, dtype=torch.long), torch.tensor([True]), 1.0
@@ -99,14 +99,14 @@ def test_points_of_a_full_cell_are_those_of_gauss():
 def test_groups_do_not_cross_borders(make_scene):
     """Of materials, laws and the regions of pins and edits."""
     stiff = MaterialRegion(HALF, E=9e4, law=NeoHookean())
-    edge, corner = Box([None] * 3, [0.031, None, None]), Box([None, None, 0.3051], [None] * 3)
+    edge, corner = up_to(x=0.031), beyond(z=0.3051)
     scene = SimulatedScene(
         Scene(generator=FlagScene(spacing=0.02)), Material(regions=[stiff]), 0.15, apart=(edge, corner)
     )
     means = scene.model.means[scene.simulated]
     for region in (HALF, edge, corner):
         inside = region.contains(means)
-        assert bool(inside.any())
+        assert inside.any()
         of_points = region.contains(scene.frame.point_to_scene(scene.points.position.double()))
         assert torch.equal(of_points[scene.owner], inside)
     assert torch.equal(scene.points.youngs_modulus[scene.owner] == 9e4, HALF.contains(means))
@@ -136,7 +136,7 @@ def test_regions_of_pins_and_edits_reach_the_scene(make_simulation):
 def test_everything_follows_a_linear_motion_and_stays_at_rest(make_scene):
     """A linear field of the nodes takes every Gaussian, faint ones too, where it takes its place."""
     scene = make_scene(fine_flag(), dx=0.15, points="grid", up=[0.0, -1.0, 0.0], metres_per_unit=0.5)
-    state = MPMSolver(dx=0.15).init_state(scene.points)
+    state = MPMSolver(0.15).init_state(scene.points)
     assert torch.equal(scene.deformed(state).means, scene.rest().means)
     assert torch.equal(scene.surface(state)[0], scene.track.place)
     F = torch.tensor([[1.1, 0.2, 0.0], [0.0, 0.9, 0.3], [-0.1, 0.0, 1.0]])
@@ -157,7 +157,7 @@ def test_no_gaussian_follows_a_node_without_mass(make_cloud):
     cloud = dataclasses.replace(cloud, scales=cloud.scales - 4 * torch.rand(3000, 1))
     dx = 0.11
     scene = SimulatedScene(Scene(generator=GivenScene(cloud), points="grid"), Material(), dx)
-    solver = MPMSolver(dx=dx)
+    solver = MPMSolver(dx)
     state = solver.init_state(scene.points)
     shift = torch.where(solver.bound.node_mass[:, None] > 0, torch.tensor([0.3, -0.2, 0.1]), 0.0)
     moved = scene.deformed(state.replace(node_displacement=shift)).means - scene.rest().means
@@ -175,8 +175,8 @@ def test_it_moves_as_with_all_points(make_simulation):
             state, _ = advanced(simulation, 12)
             ends[points] = simulation.scene.deformed(state).means - simulation.scene.rest().means
     moved = ends["gaussian"].norm(dim=-1)
-    assert float(moved.max()) > 0.1
-    assert float((ends["grid"] - ends["gaussian"]).norm(dim=-1).mean()) < 0.03 * float(moved.mean())
+    assert moved.max() > 0.1
+    assert (ends["grid"] - ends["gaussian"]).norm(dim=-1).mean() < 0.03 * moved.mean()
 
 
 def test_holes_get_further_points(make_scene):
@@ -186,7 +186,7 @@ def test_holes_get_further_points(make_scene):
     assert scene.further > 50
     where = scene.points.position[:, ::2]
     inner = torch.cartesian_prod(torch.linspace(-0.4, 0.4, 30), torch.linspace(-0.2, 0.2, 20))
-    assert float(torch.cdist(inner, where).amin(1).max()) < 0.1  # no cell of the flag is empty
+    assert torch.cdist(inner, where).amin(1).max() < 0.1  # no cell of the flag is empty
     dense = make_scene(FlagScene(spacing=0.04).generate(), dx=0.1, points="grid")
     assert dense.further == 0
     assert make_scene(few, dx=0.1, points="grid", particle_spacing=0.02).further > 2 * scene.further
@@ -230,7 +230,7 @@ def test_the_force_is_known_for_every_gaussian(make_simulation):
         simulation = make_simulation(cloud=fine_flag(), dx=0.15, scene={"points": points})
         found[points] = simulation.stepper.wind_pressure(simulation.start())
     torch.testing.assert_close(found["grid"], found["gaussian"])
-    assert float(found["grid"].amin()) > 0
+    assert found["grid"].amin() > 0
 
 
 def test_the_default_is_the_grid_where_it_is_possible(make_simulation):
@@ -238,7 +238,7 @@ def test_the_default_is_the_grid_where_it_is_possible(make_simulation):
     for formulation, few in (("total", True), ("updated", False)):
         simulation = make_simulation(cloud=cloud, scene={"points": None}, formulation=formulation)
         assert (simulation.scene.points.count < len(cloud)) is few
-    with pytest.raises(ValueError, match=r"`scene.points: grid` needs `solver.formulation: total`"):
+    with value_error(r"`scene.points: grid` needs `solver.formulation: total`"):
         make_simulation(cloud=cloud, scene={"points": "grid"}, formulation="updated")
 
 
@@ -262,8 +262,8 @@ def test_the_kernel_of_embedded_points_is_their_definition(up, kernel_device, ma
         )
         scene = scene.to(kernel_device)
         assert scene.follow.arm is not None
-        state = MPMSolver(dx=0.15).init_state(scene.points)
-        nodes = 0.02 * torch.randn(state.node_displacement.shape, generator=torch.Generator().manual_seed(1))
+        state = MPMSolver(0.15).init_state(scene.points)
+        nodes = 0.02 * torch.randn(state.node_displacement.shape, generator=seeded(1))
         state = state.replace(node_displacement=nodes.to(kernel_device))
         own = [part[scene.moving] for part in (scene.model.means.detach(), scene.rest_covariances, scene.rest_normals)]
         solid = None if stretch is None else torch.ones(len(scene.moving), dtype=torch.bool, device=kernel_device)
@@ -274,8 +274,8 @@ def test_the_kernel_of_embedded_points_is_their_definition(up, kernel_device, ma
         expected = (own[0] + scene.frame.displacement_to_scene(move), *shapes)
         found = scene.follow.drawn(state, scene.frame, *own, True, stretch, solid)
         for a, b in zip(found, expected, strict=True):
-            torch.testing.assert_close(a.double(), b.double(), rtol=1e-4, atol=2e-5 * float(b.abs().max()))
-        drawn, still = scene.deformed(state), scene.deformed(MPMSolver(dx=0.15).init_state(scene.points))
+            torch.testing.assert_close(a.double(), b.double(), rtol=1e-4, atol=2e-5 * float(peak(b)))
+        drawn, still = scene.deformed(state), scene.deformed(MPMSolver(0.15).init_state(scene.points))
         torch.testing.assert_close(drawn.means[scene.moving], found[0])
         torch.testing.assert_close(drawn.covariances[scene.moving], found[1])
         assert torch.equal(still.means, scene.rest().means)
@@ -290,7 +290,7 @@ def test_points_of_a_group_share_its_wind(law, make_scene):
     torch.testing.assert_close(ratio, ratio.mean().expand_as(ratio), rtol=1e-5, atol=0)
     forces = []
     for one in (full, scene):
-        state = MPMSolver(dx=0.1).init_state(one.points)
+        state = MPMSolver(0.1).init_state(one.points)
         forces.append(WindForce(AeroForce(law=law), WindField([3.0, 1.0, 0.5]), one.patches)(state)[0].sum(0))
     torch.testing.assert_close(*forces, rtol=1e-3, atol=1e-6)
 
@@ -337,16 +337,16 @@ def test_wind_on_the_groups_of_a_scene_is_that_on_its_patches(law, scene, make_c
     dx = 0.3 if scene == "noise" else 0.1
     scene = make_scene(cloud, dx=dx, points="grid", dtype=torch.float64)
     patches = scene.patches
-    generator = torch.Generator().manual_seed(0)
-    turn = torch.linalg.qr(torch.randn(scene.points.count, 3, 3, generator=generator, dtype=torch.float64))[0]
+    generator = seeded(0)
+    turn = torch.linalg.qr(randn(scene.points.count, 3, 3, generator=generator))[0]
     turn = turn * torch.linalg.det(turn)[:, None, None]
-    velocity = torch.randn(scene.points.count, 3, generator=generator, dtype=torch.float64)
+    velocity = randn(scene.points.count, 3, generator=generator)
     aero = AeroForce(law=law)
     force = WindForce(aero, WindField([0.0, 0.0, 0.0]), patches)
-    state = MPMSolver(dx=dx).init_state(scene.points).replace(F_total=turn, velocity=velocity)
+    state = MPMSolver(dx).init_state(scene.points).replace(F_total=turn, velocity=velocity)
     normal, area = deform_patch(turn[patches.point], patches.normal, patches.area)
     for wind in unit(10, 3, generator=generator):
         each = aero(6 * wind, velocity[patches.point], normal, area)
         expected = torch.zeros_like(velocity).index_add(0, patches.point, each)
         found = force.force(state, 6 * wind)[0]
-        assert float((found - expected).norm(dim=-1).sum()) < 0.01 * float(expected.norm(dim=-1).sum())
+        assert (found - expected).norm(dim=-1).sum() < 0.01 * expected.norm(dim=-1).sum()

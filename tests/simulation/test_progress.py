@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from shared import SMALL, refused, words
+from shared import SMALL, in_both, refused, words
 
 from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.mpm.solver import MPMSolver
@@ -84,11 +84,11 @@ def test_a_frame_that_is_done_again_is_counted_anew(clock, capsys):
     assert "substep 40 of 40, 0 ms left" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("formulation", ["total", "updated"])
+@in_both
 @pytest.mark.parametrize("looks", [1, 8])
 def test_watching_changes_no_bit(formulation, looks):
     """And every substep is told of, in order."""
-    solver = MPMSolver(dx=0.25, formulation=formulation, transfer="torch")
+    solver = MPMSolver(0.25, formulation, transfer="torch")
     points = MaterialPoints.create(
         torch.rand(200, 3), volume=1e-3, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3
     )

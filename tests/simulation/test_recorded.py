@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from shared import refused
+from shared import peak, refused, seeded, up_to, user_warning, value_error
 
 from gaussian_swaying.cli.export import main as export
 from gaussian_swaying.gaussians.cloud import joined
 from gaussian_swaying.gaussians.export import SUFFIXES, export_cloud
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.ply import read_ply, write_ply
-from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.simulation import RecordedRun, Simulation
@@ -35,7 +34,7 @@ def recorded(request, tmp_path_factory):
     flag = FlagScene(spacing=0.1).generate()
     turn = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     half = torch.tensor([0.5**0.5, -(0.5**0.5), 0.0, 0.0]).expand(len(flag), 4)  # z to y about x
-    harmonics = 0.1 * torch.randn(len(flag), 3, 3, generator=torch.Generator().manual_seed(1))
+    harmonics = 0.1 * torch.randn(len(flag), 3, 3, generator=seeded(1))
     sh = torch.cat([flag.sh[:, :1], harmonics], 1)
     quats = half * flag.quats[:, :1] if bool((flag.quats[:, 1:] == 0).all()) else half
     write_ply(place / "flag.ply", replace(flag, means=flag.means @ turn.T / 2, quats=quats, sh=sh, normals=None))
@@ -62,11 +61,11 @@ def test_the_frames_of_a_run_are_those_of_its_simulation(recorded):
     simulation, run = recorded
     for frame, found in zip(simulation.frames(FRAMES), RecordedRun(run).frames(), strict=True):
         expected, scene = frame.gaussians.to_cloud(), simulation.scene
-        moved = float((frame.gaussians.means - scene.model.means).abs().max())
+        moved = float(peak(frame.gaussians.means - scene.model.means))
         own = found.to_cloud()
         torch.testing.assert_close(own.means, expected.means, rtol=0, atol=2**-10 * moved + 1e-6)
         shapes = frame.gaussians.covariances
-        near = 2**-9 * float(shapes.abs().amax())  # F, rounded to 2^-11, is in both factors of F A F^T
+        near = 2**-9 * float(peak(shapes))  # F, rounded to 2^-11, is in both factors of F A F^T
         torch.testing.assert_close(found.covariances, shapes, rtol=0, atol=near)
         torch.testing.assert_close(own.sh, expected.sh, rtol=0, atol=2e-3)
         green = own.sh[scene.moving, 0, 0] < -1.5
@@ -170,20 +169,18 @@ def test_a_frame_saves_its_gaussians(recorded, tmp_path):
     shown = (frame.render().color.clamp(0, 1) * 255).round().numpy()
     assert np.abs(iio.imread(tmp_path / "a.png") - shown).max() <= 1
     away = LookAtCamera((0.0, -9.0, 0.0), (0.0, -99.0, 0.0), width=32, height=18)
-    (unseen,) = Simulation(
-        FlagScene(spacing=0.1), camera=away, hold=Box([None] * 3, [0.2, None, None]), device="cpu"
-    ).frames(1)
-    with pytest.warns(UserWarning, match="shows nothing: check the place of the camera and its `near`"):
+    (unseen,) = Simulation(FlagScene(spacing=0.1), camera=away, hold=up_to(x=0.2), device="cpu").frames(1)
+    with user_warning("shows nothing: check the place of the camera and its `near`"):
         unseen.save(tmp_path / "a.png")
     up = read_gaussians(tmp_path / "a.glb").means - 2 * frame.gaussians.means  # in metres, y up as in the scene
     torch.testing.assert_close(up, torch.zeros_like(up), rtol=0, atol=1e-5)
     before = sorted(tmp_path.iterdir())
-    with pytest.raises(ValueError, match=r"Cannot tell the format of .*frame\.obj: .*\.splat"):
+    with value_error(r"Cannot tell the format of .*frame\.obj: .*\.splat"):
         frame.save(tmp_path / "frame.obj")
-    with pytest.raises(ValueError, match=f"`format` to be one of {', '.join(SUFFIXES)}"):
+    with value_error(f"`format` to be one of {', '.join(SUFFIXES)}"):
         frame.save(tmp_path / "frame.ply", format="obj")
     with pytest.raises(FileNotFoundError, match="is not a folder; create it first"):
         frame.save(tmp_path / "none" / "0001.ply")
-    with pytest.raises(ValueError, match="have no opacities: set `model`"):
+    with value_error("have no opacities: set `model`"):
         export_cloud(tmp_path / "c.ply", replace(frame.gaussians, model=None))
     assert sorted(tmp_path.iterdir()) == before

@@ -4,10 +4,10 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from shared import near, peak, up_to, value_error
 
 from gaussian_swaying._fixed import changed
 from gaussian_swaying.gaussians.ply import read_ply
-from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.recording.layout import video_file
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera
@@ -97,11 +97,11 @@ def test_the_force_is_that_of_the_wind(make_simulation):
     camera = simulation.painter.camera_at(0)
     picture = simulation.painter.draw_pressure(pressure, simulation.scene.rest(), camera, 2 * float(pressure[0]))
     covered = picture.any(-1)
-    assert bool(covered.any())
+    assert covered.any()
     expected = colormap(torch.tensor(0.5)).expand_as(picture[covered])
-    torch.testing.assert_close(picture[covered], expected, rtol=0, atol=1e-5)
+    near(picture[covered], expected, 1e-5)
     moving = state.replace(velocity=torch.tensor([0.0, 4.0, 0.0]).expand_as(state.velocity))
-    assert float(simulation.stepper.wind_pressure(moving).abs().max()) < 1e-6
+    assert peak(simulation.stepper.wind_pressure(moving)) < 1e-6
     assert not make_simulation(aero=AeroForce(air_density=0.0)).stepper.wind_pressure(state).any()
 
 
@@ -109,24 +109,24 @@ def test_values_reach_every_gaussian_that_moves(make_cloud, make_scene):
     """Faint ones take that of the neighbour that carries them; those outside the region have none."""
     cloud = make_cloud()
     cloud.opacities[5] = -6.0
-    scene = make_scene(cloud, region=Box([None, None, None], [0.5, None, None]))
+    scene = make_scene(cloud, region=up_to(x=0.5))
     values = torch.arange(1.0, 1 + len(scene.simulated))
     found = scene.on_gaussians(values[scene.owner])
     assert torch.equal(found[scene.simulated], values)
     assert torch.equal(found[scene.carried], values[scene.owner[len(scene.simulated) :]])
     static = torch.ones(len(cloud), dtype=torch.bool)
     static[scene.moving] = False
-    assert bool(static.any())
+    assert static.any()
     assert not found[static].any()
 
 
 def test_bad_names_and_renders(make_cloud, make_simulation):
-    with pytest.raises(ValueError, match=r"names of `cameras` .* but got '\.\./up'"):
+    with value_error(r"names of `cameras` .* but got '\.\./up'"):
         make_simulation(parts={"cameras": {"../up": SIDE}})
     inside = _cameras(
         make_simulation(make_cloud(), pinned=False), near=OrbitCamera(width=8, height=8, radius=0.01, elevation=0.1)
     )
-    with pytest.raises(ValueError, match=r"lies inside the object.*`cameras\.near\.init_args\.radius`"):
+    with value_error(r"lies inside the object.*`cameras\.near\.init_args\.radius`"):
         inside.painter.check_camera(0)
     for renders, word in ((["colour"], "recorder.renders"), ([], "list of different ones"), ("color", "list of texts")):
         with pytest.raises((TypeError, ValueError), match=word):

@@ -1,9 +1,8 @@
 """Very stiff material in the wind: how much energy rounding adds, and where it is refused."""
 
-import pytest
 import torch
+from shared import up_to, value_error
 
-from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.timestep import rounding_speed
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.body import Material
@@ -11,7 +10,7 @@ from gaussian_swaying.simulation.simulation import Simulation
 
 
 def _flag(E, dtype, wind=(6.0, 1.5, 0.0), **settings):
-    hold = Box([None, None, None], [0.11, None, None])
+    hold = up_to(x=0.11)
     given = {"frame_dt": 1e-4, "device": "cpu", "dtype": dtype} | settings
     return Simulation(FlagScene(spacing=0.1), Material(E=E, **given.pop("material", {})), hold=hold, wind=wind, **given)
 
@@ -45,7 +44,7 @@ def test_what_rounding_adds_to_the_energy_is_bounded():
 
 def test_material_that_rounding_shakes_is_refused():
     """At 1e12 Pa kinetic energy was 12 times the work of the wind after 1e-4 s."""
-    with pytest.raises(ValueError, match=r"Rounding to float32 may .* lower `material.E` .* or set `dtype` to float64"):
+    with value_error(r"Rounding to float32 may .* lower `material.E` .* or set `dtype` to float64"):
         _flag(1e12, "float32").start()
     extra, work, _ = _energy(_flag(1e12, "float64"), 1)
     assert abs(extra) < 1e-2 * work

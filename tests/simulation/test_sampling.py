@@ -4,9 +4,9 @@ import dataclasses
 
 import pytest
 import torch
+from shared import double, up_to
 
 from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.simulation.body import Samples, grouped
 
 DOUBLE = torch.float64
@@ -15,14 +15,14 @@ FRAME = SimFrame(torch.zeros(3, dtype=DOUBLE), torch.eye(3, dtype=DOUBLE), 0.5)
 
 def _pairs():
     """Eight samples in one cell, on one sheet, two by two at the same place."""
-    place = torch.tensor([[0.9, 0.9, 1.0], [1.1, 0.9, 1.0], [0.9, 1.1, 1.0], [1.1, 1.1, 1.0]], dtype=DOUBLE)
+    place = double([[0.9, 0.9, 1.0], [1.1, 0.9, 1.0], [0.9, 1.1, 1.0], [1.1, 1.1, 1.0]])
     each = {
         name: torch.ones(8, dtype=DOUBLE)
         for name in ("body_area", "area", "volume", "E", "density", "thickness", "bending", "damping")
     }
     return Samples(
         position=place.repeat_interleave(2, 0),
-        normal=torch.tensor([0.0, 0.0, 1.0], dtype=DOUBLE).repeat(8, 1),
+        normal=double([0.0, 0.0, 1.0]).repeat(8, 1),
         nu=torch.full((8,), 0.3, dtype=DOUBLE),
         law_index=torch.zeros(8, dtype=torch.long),
         surface=torch.ones(8, dtype=torch.bool),
@@ -58,7 +58,7 @@ def test_a_group_never_mixes_what_differs(name, value):
     assert len(points.mass) == 2
     for point in (0, 1):
         own = getattr(samples, name)[owner == point]
-        assert bool((own == own[0]).all())
+        assert (own == own[0]).all()
         assert len(own) == 4
 
 
@@ -72,7 +72,7 @@ def test_areas_that_differ_share_a_group_if_all_feel_the_wind():
 def test_a_group_ends_at_the_border_of_a_region():
     """The frame has half a metre per unit: x = 1 m is 2 units."""
     samples = _pairs()
-    pinned = Box([None] * 3, [2.0, None, None])
+    pinned = up_to(x=2.0)
     _, owner, _ = grouped(samples, 1.0, 1, [pinned], FRAME, DOUBLE)
     left = samples.position[:, 0] < 1
     assert len(owner.unique()) == 2

@@ -2,10 +2,10 @@
 
 import dataclasses
 import math
-import warnings
 
 import pytest
 import torch
+from shared import EYE, double, near, rand, seeded, silent, up_to, user_warning, value_error
 from small_scenes import together
 
 from gaussian_swaying.gaussians.filling import InteriorFilling
@@ -21,16 +21,16 @@ from gaussian_swaying.simulation import body
 from gaussian_swaying.simulation.body import Material, MaterialRegion, Scene, SimulatedScene, cell_volume
 from gaussian_swaying.simulation.model import Edit
 
-LEFT = Box([None, None, None], [0.5, None, None])
+LEFT = up_to(x=0.5)
 UPS = [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [0.3, -0.7, 0.2]]
 
 
 def _rest_state(scene):
-    return MPMSolver(dx=0.25).init_state(scene.points)
+    return MPMSolver(0.25).init_state(scene.points)
 
 
 def _rotation(dtype=torch.float64):
-    q, r = torch.linalg.qr(torch.rand(3, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64))
+    q, r = torch.linalg.qr(rand(3, 3, generator=seeded(5)))
     q = q * torch.sign(torch.diagonal(r))
     return (q * torch.sign(torch.linalg.det(q))).to(dtype)
 
@@ -79,7 +79,7 @@ def test_faint_gaussians_outside_the_region_stay(make_cloud, make_scene):
     for faint, count in (("carry", 40), ("drop", 40 - int((~outside)[1::2].sum()))):
         scene = make_scene(cloud, faint=faint, region=LEFT)
         assert len(scene.model.means) == count
-        assert not bool((scene.model.means[scene.carried, 0] > 0.5).any())
+        assert not (scene.model.means[scene.carried, 0] > 0.5).any()
 
 
 def test_carried_gaussians_follow_their_nearest_particle(make_cloud, make_scene):
@@ -87,8 +87,8 @@ def test_carried_gaussians_follow_their_nearest_particle(make_cloud, make_scene)
     cloud = _faint_cloud(make_cloud)
     scene = make_scene(cloud)
     state = _rest_state(scene)
-    F = torch.eye(3) + 0.3 * torch.rand(20, 3, 3, generator=torch.Generator().manual_seed(3))
-    shift = torch.rand(20, 3, generator=torch.Generator().manual_seed(4))
+    F = torch.eye(3) + 0.3 * torch.rand(20, 3, 3, generator=seeded(3))
+    shift = torch.rand(20, 3, generator=seeded(4))
     deformed = scene.deformed(state.replace(position=state.position + shift, F_total=F))
     for k, index in enumerate(scene.carried.tolist()):
         particle = int((cloud.means[::2] - cloud.means[index]).norm(dim=-1).argmin())
@@ -106,10 +106,10 @@ def test_nothing_moves_at_rest(up, make_cloud, make_scene):
     cloud.means[1::2] *= 7.3  # arms that do not round to nothing
     scene = make_scene(cloud, up=up, longest_side=0.37)
     for formulation in ("total", "updated"):
-        deformed = scene.deformed(MPMSolver(dx=0.25, formulation=formulation).init_state(scene.points))
+        deformed = scene.deformed(MPMSolver(0.25, formulation).init_state(scene.points))
         assert torch.equal(deformed.means, scene.model.means)
         assert torch.equal(deformed.covariances, scene.rest_covariances)
-        torch.testing.assert_close(deformed.normals, scene.rest_normals, rtol=0, atol=1e-6)
+        near(deformed.normals, scene.rest_normals, 1e-6)
 
 
 @pytest.mark.parametrize("up", UPS)
@@ -122,7 +122,7 @@ def test_rotations_are_left_out_where_nobody_asks(up, settings, make_cloud, make
     facing = scene.frame.direction_to_sim(scene.rest_normals[scene.moving])
     torch.testing.assert_close(scene.rest_facing, facing)
     state = _rest_state(scene)
-    F = torch.eye(3) + 0.3 * torch.rand(scene.points.count, 3, 3, generator=torch.Generator().manual_seed(3))
+    F = torch.eye(3) + 0.3 * torch.rand(scene.points.count, 3, 3, generator=seeded(3))
     state = state.replace(position=state.position + 0.2, F_total=F)
     full, plain = scene.deformed(state), scene.deformed(state, rotations=False)
     for name in ("means", "covariances", "normals"):
@@ -139,16 +139,16 @@ def test_a_rigid_motion_moves_everything_rigidly(up, make_cloud, make_scene):
     """Rotation and translation given in metres; the Gaussians turn by its picture in scene axes."""
     scene = make_scene(_faint_cloud(make_cloud), up=up, longest_side=0.5, dtype=torch.float64)
     state, frame = _rest_state(scene), scene.frame
-    R, shift = _rotation(), torch.tensor([0.2, -0.1, 0.4], dtype=torch.float64)
+    R, shift = _rotation(), double([0.2, -0.1, 0.4])
     F = R.expand(20, 3, 3)
     deformed = scene.deformed(state.replace(position=state.position @ R.T + shift, F_total=F, F_elastic=F))
     turn = (frame.rotation.T @ R @ frame.rotation).float()
     rest = scene.rest()
     expected = frame.point_to_scene(frame.point_to_sim(rest.means.double()) @ R.T + shift).float()
-    torch.testing.assert_close(deformed.means, expected, rtol=0, atol=2e-6)
-    torch.testing.assert_close(deformed.covariances, turn @ rest.covariances @ turn.T, rtol=0, atol=1e-7)
-    torch.testing.assert_close(deformed.normals, rest.normals @ turn.T, rtol=0, atol=1e-6)
-    torch.testing.assert_close(deformed.rotations, turn.expand(40, 3, 3), rtol=0, atol=1e-6)
+    near(deformed.means, expected, 2e-6)
+    near(deformed.covariances, turn @ rest.covariances @ turn.T, 1e-7)
+    near(deformed.normals, rest.normals @ turn.T, 1e-6)
+    near(deformed.rotations, turn.expand(40, 3, 3), 1e-6)
 
 
 def test_normals_of_a_shear_are_not_those_of_its_rotation(make_scene):
@@ -198,10 +198,10 @@ def test_what_is_torn_is_drawn_as_a_patch_of_a_solid_and_as_a_grain_of_sand(make
     assert float(free.deformed(state).covariances[:, 0, 0].max()) == pytest.approx(900 * 0.12**2, rel=1e-3)
     for scene, grains in ((solid, torch.zeros_like(sand)), (mixed, sand)):
         kept = scene.deformed(state).covariances
-        assert float(kept[:, 0, 0].max()) < 8 * 0.12**2
+        assert kept[:, 0, 0].max() < 8 * 0.12**2
         torch.testing.assert_close(kept[~grains, 1, 1], torch.full_like(kept[~grains, 1, 1], flat), rtol=0.01, atol=0)
         if bool(grains.any()):
-            assert float(kept[grains, 1, 1].min()) > 0.5 * 0.12**2
+            assert kept[grains, 1, 1].min() > 0.5 * 0.12**2
     mixed.points = solid.points  # as an edit does it
     assert torch.equal(mixed.deformed(state).covariances, solid.deformed(state).covariances)
 
@@ -249,7 +249,7 @@ def test_simulations_of_the_same_gaussians_compute_their_areas_once(make_cloud, 
     assert len(asked) == 1
     assert torch.equal(first.patches.area, second.patches.area)
     first.patches.area.zero_()
-    assert bool((make_scene(cloud).patches.area > 0).all())
+    assert (make_scene(cloud).patches.area > 0).all()
     cloud.opacities[3] -= 1
     make_scene(cloud)
     make_scene(cloud, area="open")
@@ -284,7 +284,7 @@ def test_material_regions(make_cloud, make_scene):
         thickness=0.01,
         regions=[
             MaterialRegion(LEFT, E=2e4, nu=0.4, density=50.0, thickness=0.03),
-            MaterialRegion(Box([None, None, None], [0.25, None, None]), E=3e4),
+            MaterialRegion(up_to(x=0.25), E=3e4),
         ],
     )
     cloud = make_cloud()
@@ -322,7 +322,7 @@ def test_a_region_in_the_axes_of_the_wind_says_so(what, far, make_simulation):
         "edits": {"parts": {"edits": [Edit(region, E=1.0)]}},
     }[what]
     flag = dataclasses.replace(cloud, means=means, scales=cloud.scales.mean(-1, keepdim=True).expand(-1, 3))  # balls
-    with pytest.raises(ValueError, match=r"Box\(min=") as caught:
+    with value_error(r"Box\(min=") as caught:
         make_simulation(flag, pinned=False, **({"scene": {"up": up}} | parts)).start()
     said = str(caught.value)
     assert "between [0.05, -0.75, " in said  # in scene axes
@@ -375,7 +375,7 @@ def test_a_region_in_the_axes_of_the_wind_says_so(what, far, make_simulation):
     ],
 )
 def test_settings_that_make_no_sense_are_named(make, field):
-    with pytest.raises(ValueError, match=f"`{field}`"):
+    with value_error(f"`{field}`"):
         make()
 
 
@@ -394,14 +394,14 @@ def test_large_gaussians_get_further_points(make_scene):
     """They follow the Gaussians, have normals, areas and material of their own place, and are not drawn."""
     cloud = _sheet_with_a_hole()
     count = len(cloud)
-    lower = MaterialRegion(region=Box([None, None, None], [None, None, 0.49]), density=1000.0)
+    lower = MaterialRegion(region=up_to(z=0.49), density=1000.0)
     material = Material(density=100.0, thickness=0.02, regions=[lower])
     plain = make_scene(cloud, material, 0.1)
     full = make_scene(cloud, material, 0.1, particle_spacing=0.05)
     assert plain.on_surface == plain.points.count == count
     assert full.on_surface == full.points.count > count + 50
     assert torch.equal(full.points.position[:count], plain.points.position)
-    assert float(plain.patches.area.sum()) < 0.9 < float(full.patches.area.sum()) < 1.03
+    assert plain.patches.area.sum() < 0.9 < full.patches.area.sum() < 1.03
     density = full.points.mass / full.points.volume
     below = full.frame.point_to_scene(full.points.position.double())[:, 2] < 0.49
     torch.testing.assert_close(density, torch.where(below, 1000.0, 100.0))
@@ -436,7 +436,7 @@ def test_three_layers_are_no_thicker_than_a_cell(make_scene):
         (thick, r"0\.11 m thick needs cells at least as large, but `solver\.dx` is 0\.1 m"),
         (Material(E=1e3, bending=0.1), r"outer layers 0\.\d+ m apart needs cells .* lower `material\.bending`"),
     ):
-        with pytest.raises(ValueError, match=told):
+        with value_error(told):
             make_scene(cloud, material, 0.1, layers=3)
 
 
@@ -453,14 +453,14 @@ def test_three_layers_are_a_plate(make_cloud, make_scene):
     moment = (three.points.mass * height.square()).sum() / three.points.mass.sum()
     assert float(moment) == pytest.approx(0.03**2 / 12, rel=1e-4)
     assert torch.equal(three.patches.areas()[:count], one.patches.area)  # the wind meets the sheet once
-    assert not bool(three.patches.areas()[count:].any())
+    assert not three.patches.areas()[count:].any()
     assert len(three.deformed(_rest_state(three)).means) == len(cloud)
 
 
 def test_bending_says_where_the_layers_lie(make_cloud, make_scene):
     """D = E h d² / (12 (1 - nu²)) for a distance d of the outer layers: mass and E h stay, also in a region."""
     D = 2e5 * 0.01 * 0.004**2 / (12 * (1 - 0.3**2))
-    lower = MaterialRegion(Box([None] * 3, [None, None, 0.5]), bending=4 * D)
+    lower = MaterialRegion(up_to(z=0.5), bending=4 * D)
     plate = Material(E=2e5, thickness=0.01)
     fabric = dataclasses.replace(plate, bending=D, regions=[lower])
     one, as_plate, bent = (make_scene(make_cloud(), m, layers=n) for m, n in ((plate, 1), (plate, 3), (fabric, 3)))
@@ -476,17 +476,16 @@ def test_bending_says_where_the_layers_lie(make_cloud, make_scene):
 @pytest.mark.parametrize("law", [FixedCorotated(), NeoHookean()])
 def test_a_negative_ratio_whose_energy_has_no_least_value_is_warned_of(law, make_scene):
     """Stretched or compressed far enough, the energy falls below that at rest; Hencky's never does."""
-    nu, E = torch.tensor(-0.3, dtype=torch.float64), torch.tensor(1.0, dtype=torch.float64)
+    nu, E = double(-0.3), double(1.0)
     lame = E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
     sizes = torch.logspace(-3, 1, 41, dtype=torch.float64)
-    F = sizes[:, None, None] * torch.eye(3, dtype=torch.float64)
-    assert float(law.energy(F, *lame).min()) < -0.01
-    assert float(StVKHencky().energy(F, *lame).min()) >= 0
+    F = sizes[:, None, None] * EYE
+    assert law.energy(F, *lame).min() < -0.01
+    assert StVKHencky().energy(F, *lame).min() >= 0
     cloud = _sheet_with_a_hole()
-    with pytest.warns(UserWarning, match=f"`material.nu` below 0 the energy of {type(law).__name__} has no least"):
+    with user_warning(f"`material.nu` below 0 the energy of {type(law).__name__} has no least"):
         make_scene(cloud, Material(nu=-0.3, law=law), 0.1)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with silent():
         make_scene(cloud, Material(nu=0.0, law=law), 0.1)
         make_scene(cloud, Material(nu=-0.3, law=StVKHencky()), 0.1)
 
@@ -505,7 +504,7 @@ def test_layers_share_the_volume_of_a_cell(make_scene):
 
 def test_normals_from_neighbours(make_cloud, make_scene):
     """Of a sheet whose Gaussians are turned at random: patches, pictures and pressure use the normal of the sheet."""
-    generator = torch.Generator().manual_seed(2)
+    generator = seeded(2)
     cloud = FlagScene(width=0.6, height=0.4, spacing=0.02, ripple=0.0).generate()
     turn = torch.nn.functional.pad(0.15 * torch.randn(len(cloud.means), 3, generator=generator), (1, 0), value=1.0)
     cloud = dataclasses.replace(cloud, quats=rotation_to_quat(quat_to_rotation(turn) @ quat_to_rotation(cloud.quats)))
@@ -515,15 +514,15 @@ def test_normals_from_neighbours(make_cloud, make_scene):
         scene = Scene(ply="unused", normals=normals, metres_per_unit=1.0)
         found[normals] = SimulatedScene(scene, material, dx=0.05, cloud=cloud)
     flat = found["neighbours"].rest_normals[:, 1].abs()
-    assert float(flat.min()) > 1 - 1e-6
-    assert float(found["smallest_axis"].rest_normals[:, 1].abs().min()) < 0.97
-    assert float(found["neighbours"].rest_facing[:, 1].abs().min()) > 1 - 1e-6
-    assert float(found["neighbours"].patches.normal[:, 1].abs().min()) > 1 - 1e-6
+    assert flat.min() > 1 - 1e-6
+    assert found["smallest_axis"].rest_normals[:, 1].abs().min() < 0.97
+    assert found["neighbours"].rest_facing[:, 1].abs().min() > 1 - 1e-6
+    assert found["neighbours"].patches.normal[:, 1].abs().min() > 1 - 1e-6
 
 
 def test_a_trajectory_has_the_whole_deformation(make_scene):
     """Where a material flows, its elastic part differs from it."""
     scene = make_scene(FlagScene(spacing=0.2).generate(), Material(law=Sand(35.0)))
-    state = MPMSolver(dx=0.4, formulation="updated").init_state(scene.points)
+    state = MPMSolver(0.4, "updated").init_state(scene.points)
     state = state.replace(F_total=1.5 * state.F_total)
     assert torch.equal(scene.surface(state)[1], state.F_total)

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from shared import in_both, longest, near, up_to, value_error
 
 from gaussian_swaying.gaussians.filling import InteriorFilling
-from gaussian_swaying.geometry.regions import Box, Not, Sphere
+from gaussian_swaying.geometry.regions import Not, Sphere
 from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.recording.recorder import Recorder
@@ -44,7 +45,7 @@ def _simulation(material=None, solver=None, **scene):
     return Simulation(
         Scene(**settings),
         material or Material(density=200.0),
-        solver=MPMSolver(dx=DX, boundaries=[PinnedRegion(Box([None] * 3, [None, None, -0.24]))], **(solver or {})),
+        solver=MPMSolver(DX, boundaries=[PinnedRegion(up_to(z=-0.24))], **(solver or {})),
         wind=WindField([6.0, 0.0, 0.0]),
         camera=OrbitCamera(width=32, height=18, radius=2.0),
         device="cpu",
@@ -59,7 +60,7 @@ def test_the_body_weighs_density_times_volume(gaussians):
         torch.testing.assert_close(scene.points.mass, 200.0 * scene.points.volume)
         assert abs(float(scene.points.mass.sum()) / 200.0 - VOLUME) < 0.25 * DX * AREA
         assert scene.filled == scene.points.count - len(scene.simulated) > 0
-        assert bool((scene.points.mass > 0).all())
+        assert (scene.points.mass > 0).all()
 
 
 def test_filled_points_feel_no_wind():
@@ -67,7 +68,7 @@ def test_filled_points_feel_no_wind():
     filled, hollow = _scene(), _scene(filling=None)
     count = len(filled.simulated)
     assert torch.equal(filled.patches.areas()[:count], hollow.patches.area)
-    assert not bool(filled.patches.areas()[count:].any())
+    assert not filled.patches.areas()[count:].any()
     forces = []
     for settings in ({}, {"filling": None}):
         simulation = _simulation(**settings)
@@ -76,8 +77,8 @@ def test_filled_points_feel_no_wind():
         state = state.replace(F_total=turned.expand_as(state.F_total))
         forces.append(simulation.stepper.wind_force(state)[0])
     torch.testing.assert_close(forces[0][:count], forces[1])
-    assert not bool(forces[0][count:].any())
-    assert float(forces[1].norm(dim=-1).min()) > 0
+    assert not forces[0][count:].any()
+    assert forces[1].norm(dim=-1).min() > 0
 
 
 def test_wind_on_the_surface_or_on_all():
@@ -87,12 +88,12 @@ def test_wind_on_the_surface_or_on_all():
     count = len(surface.simulated)
     assert count > 2 * shell
     windy = surface.patches.areas()[:count] > 0
-    assert bool(windy[:shell].all())
+    assert windy[:shell].all()
     deep = 0.3 - surface.model.means.norm(dim=-1)
-    assert not bool(windy[deep > DX].any())
-    assert bool((everywhere.patches.areas()[:count] > 0).all())
-    assert not bool(everywhere.patches.areas()[count:].any())
-    assert float(everywhere.patches.area.sum()) > 1.5 * float(surface.patches.area.sum())
+    assert not windy[deep > DX].any()
+    assert (everywhere.patches.areas()[:count] > 0).all()
+    assert not everywhere.patches.areas()[count:].any()
+    assert everywhere.patches.area.sum() > 1.5 * surface.patches.area.sum()
     assert torch.equal(everywhere.patches.areas()[:count][windy], surface.patches.areas()[:count][windy])
     assert torch.equal(surface.points.mass, everywhere.points.mass)
     # with cells so small that only the outer Gaussians are less than one deep, their areas are the ball's
@@ -127,7 +128,7 @@ def test_carried_gaussians_follow_gaussians():
     assert len(scene.carried) > 0
     moved = torch.cat([state.position[: len(scene.simulated)] + 0.2, state.position[len(scene.simulated) :]])
     means = scene.deformed(state.replace(position=moved)).means
-    torch.testing.assert_close(means, cloud.means + 0.2, rtol=0, atol=1e-6)
+    near(means, cloud.means + 0.2, 1e-6)
 
 
 def test_the_frame_reaches_the_filling():
@@ -137,22 +138,22 @@ def test_the_frame_reaches_the_filling():
     torch.testing.assert_close(large.points.volume, 1000 * unit.points.volume)
     turned = _scene(up=[0.0, -1.0, 0.0])
     assert float(turned.points.volume.sum()) == pytest.approx(VOLUME, abs=0.25 * DX * AREA)
-    assert float(turned.points.position.norm(dim=-1).max()) < 0.3 + 0.5 * DX
+    assert longest(turned.points.position) < 0.3 + 0.5 * DX
 
 
 def test_regions_reach_the_filling():
     """They are in scene units and axes."""
-    lower = MaterialRegion(Box([None, None, None], [None, 0.05, None]), density=400.0)
+    lower = MaterialRegion(up_to(y=0.05), density=400.0)
     settings = {"metres_per_unit": 10.0, "up": [0.0, 1.0, 0.0], "filling": InteriorFilling(spacing=5 * DX)}
     scene = _scene(material=Material(density=200.0, regions=[lower]), **settings)
     below = scene.frame.point_to_scene(scene.points.position)[:, 1] <= 0.05
     assert 0 < int(below[len(scene.simulated) :].sum()) < scene.filled
     assert torch.equal(scene.points.mass, scene.points.volume * torch.where(below, 400.0, 200.0))
-    half = _scene(region=Box([None, None, None], [None, None, 0.1]))
+    half = _scene(region=up_to(z=0.1))
     assert float(half.points.position[:, 2].max() - half.points.position[:, 2].min()) < 0.4 + 1e-6
     hole = _scene(region=Not(Sphere([0.0, 0.0, 0.0], 0.15)), metres_per_unit=2.0)
     assert len(hole.simulated) == len(hole.model.means)
-    assert float(hole.points.position.norm(dim=-1).min()) > 2 * 0.15
+    assert hole.points.position.norm(dim=-1).min() > 2 * 0.15
 
 
 def test_physgaussians_volumes_count_the_filling():
@@ -161,7 +162,7 @@ def test_physgaussians_volumes_count_the_filling():
 
 
 def test_an_open_surface_is_refused():
-    with pytest.raises(ValueError, match="remove `filling`"):
+    with value_error("remove `filling`"):
         _scene(generator=FlagScene(spacing=0.05))
 
 
@@ -183,7 +184,7 @@ def test_a_run_of_a_filled_solid(tmp_path):
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("formulation", ["total", "updated"])
+@in_both
 def test_a_filled_solid_on_a_gpu(formulation):
     """The kernels take patches of no area; the same run as on the CPU."""
     ends = []
@@ -191,7 +192,7 @@ def test_a_filled_solid_on_a_gpu(formulation):
         simulation = _simulation(solver={"formulation": formulation}).to(device)
         state, _ = simulation.advance(simulation.start())
         ends.append(state.position.cpu())
-    torch.testing.assert_close(ends[0], ends[1], rtol=0, atol=1e-5)
+    near(ends[0], ends[1], 1e-5)
 
 
 SMALL = ["--config", str(ROOT / "configs/sim/solid_surface_wind.yaml"), "--device", "cpu"]
@@ -208,5 +209,5 @@ def test_the_pair_of_the_experiment_differs_in_the_wind_alone(tmp_path):
     surface, everywhere = (simulation.scene for simulation in made)
     assert torch.equal(surface.points.position, everywhere.points.position)
     assert torch.equal(surface.points.mass, everywhere.points.mass)
-    assert float(everywhere.patches.area.sum()) > float(surface.patches.area.sum())
+    assert everywhere.patches.area.sum() > surface.patches.area.sum()
     assert work[1] > work[0]

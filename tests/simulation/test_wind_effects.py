@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from shared import waits
+from shared import double, waits
 
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.simulation.step import parts_of
@@ -25,7 +25,7 @@ def test_places_are_converted_once(make_simulation):
     )
     simulation.wind = given
     frame = simulation.scene.frame
-    expected = 2.0 * (torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64) - frame.origin)
+    expected = 2.0 * (double([1.0, 2.0, 3.0]) - frame.origin)
     for _ in range(2):
         sphere, profile = simulation.wind.effects
         assert sphere.center == pytest.approx(expected.tolist())
@@ -42,7 +42,7 @@ def test_shelter_is_refreshed_in_every_frame(make_simulation):
     for _ in range(3):
         state, _ = simulation.advance(state)
         tables.append(simulation.wind.effects[0].table.clone())
-    assert float(tables[0].min()) < 0.99
+    assert tables[0].min() < 0.99
     assert not torch.equal(tables[0], tables[2])
 
 
@@ -65,7 +65,7 @@ def test_every_effect_can_be_named_in_a_configuration(tmp_path):
         effect.split(": ")[1].split(",")[0].rstrip("}") for effect in effects
     ]
     state, _ = simulation.advance(simulation.start())
-    assert bool(torch.isfinite(state.position).all())
+    assert torch.isfinite(state.position).all()
 
 
 def test_the_next_frame_is_foreseen_in_its_own_shelter(make_simulation):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import imageio.v3 as iio
 import pytest
 import torch
+from shared import near, peak, value_error
 
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
@@ -35,7 +36,7 @@ def test_streaks_follow_the_wind(make_simulation):
     moved, _ = streaks(simulation.stepper, state.replace(time=state.time + short), camera)
     drift = moved[:, 0] - places[:, 0]
     kept = drift.norm(dim=-1) < 10 * short * 5.0  # the others came in again at the other side
-    assert float(kept.float().mean()) > 0.9
+    assert kept.float().mean() > 0.9
     torch.testing.assert_close(drift[kept], (short * torch.tensor([3.0, 0.0, 4.0])).double().expand_as(drift[kept]))
 
 
@@ -68,8 +69,8 @@ def test_streaks_fill_the_picture_and_are_an_eighth_of_it_long(make_simulation, 
     pixel = pixel.view(len(places), -1, 2)
     long = (pixel[:, -1] - pixel[:, 0]).norm(dim=-1)
     torch.testing.assert_close(long, torch.full_like(long, 1.15 * 160 / 8), rtol=1e-5, atol=0)
-    assert bool((pixel[:, 0].amin(0) < 0).all())
-    assert bool((pixel[:, 0].amax(0) > torch.tensor([160, height])).all())
+    assert (pixel[:, 0].amin(0) < 0).all()
+    assert (pixel[:, 0].amax(0) > torch.tensor([160, height])).all()
 
 
 def test_the_object_hides_what_is_behind_it(make_simulation):
@@ -80,10 +81,10 @@ def test_the_object_hides_what_is_behind_it(make_simulation):
     found = draw_wind(simulation.stepper, state, camera, picture)
     pale = 0.75 * picture.color.clamp(0, 1) + 0.25
     assert found.shape == picture.color.shape
-    assert float((found - pale).abs().amax(-1).gt(0.05).float().mean()) > 0.02
+    assert (found - pale).abs().amax(-1).gt(0.05).float().mean() > 0.02
     simulation.wind = WindField([0.0, 0.0, 0.0])
     still = draw_wind(simulation.stepper, state, camera, picture)
-    assert bool(torch.isfinite(still).all())
+    assert torch.isfinite(still).all()
 
 
 @pytest.mark.parametrize("flow", [[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]])
@@ -122,14 +123,14 @@ def test_vorticity_is_red_where_air_turns_against_the_clock(spin):
     size = float((state.position.amax(0) - state.position.amin(0)).amax())
     colour = torch.tensor([0.70, 0.09, 0.17] if spin > 0 else [0.13, 0.40, 0.67])
     under = 0.5 * seen.color[32, 62] + 0.5
-    torch.testing.assert_close(found[32, 62], torch.lerp(under, colour, 20.0 * size / (8 * 3.0)), rtol=0, atol=2e-3)
+    near(found[32, 62], torch.lerp(under, colour, 20.0 * size / (8 * 3.0)), 2e-3)
     red_less_blue = change[..., 0] - change[..., 2]
     assert float(red_less_blue[32, 62]) * spin > 1.0  # behind the flag
-    assert float(change[2, 2].abs().max()) == 0
+    assert float(peak(change[2, 2])) == 0
     bare = draw_vorticity(stepper, state.replace(air=torch.zeros_like(state.air)), camera, seen)
-    assert float((bare - (0.5 * seen.color.clamp(0, 1) + 0.5)).abs().max()) == 0
+    assert float(peak(bare - (0.5 * seen.color.clamp(0, 1) + 0.5))) == 0
     covered = mean_depth(seen) > 0
-    assert bool(covered[32, 48])
+    assert covered[32, 48]
     for nearer, hides in ((0.9, True), (1.1, False)):  # the flag in front of the plane, and behind it
         moved = replace(seen, depth=nearer * seen.depth)
         change = draw_vorticity(stepper, state, camera, moved) - (0.5 * seen.color.clamp(0, 1) + 0.5)
@@ -140,6 +141,6 @@ def test_a_run_draws_vorticity_in_computed_air_alone(make_simulation, tmp_path):
     simulation = _in_air()
     simulation.run(tmp_path / "run", 1, progress=False, recorder=Recorder(renders=["vorticity"]))
     assert iio.imread(tmp_path / "run" / "vorticity" / "00000.png").ndim == 3
-    with pytest.raises(ValueError, match="which only computed air has: add `air`"):
+    with value_error("which only computed air has: add `air`"):
         make_simulation().run(tmp_path / "other", 1, progress=False, recorder=Recorder(renders=["vorticity"]))
     assert not (tmp_path / "other").exists()

@@ -4,8 +4,8 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from shared import up_to
 
-from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.kernels import cpu
 from gaussian_swaying.kernels.language import INTERPRETED
 from gaussian_swaying.mpm.pins import PinnedRegion
@@ -96,8 +96,8 @@ def test_a_cost_is_that_of_its_run(make_simulation):
 @pytest.mark.gpu
 def test_kernels_are_loaded_before_a_gpu_is_timed():
     """They are a part of the start, and not of a frame."""
-    pole = PinnedRegion(Box([None] * 3, [0.06, None, None]))
-    solver = MPMSolver(dx=0.05, boundaries=[pole], damping=0.2)
+    pole = PinnedRegion(up_to(x=0.06))
+    solver = MPMSolver(0.05, boundaries=[pole], damping=0.2)
     for _ in range(2):
         simulation = Simulation(FlagScene(spacing=0.02), solver=solver, wind=[5.0, 1.0, 0.0], device="cuda")
         assert 0 < estimate_cost(simulation, 250).startup_seconds <= cost_module.WARM_UP

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from shared import unit
+from shared import seeded, unit, value_error
 from small_scenes import guess, plain_cloud, started, together, turned_cloud
 from things import AWAY, ball, block, guitar_on_a_stand, lamp, man, plant_in_a_pot, splat, tube
 
@@ -30,7 +30,7 @@ def tree(floor=True, offset=5.0):
     """A floor of 2 x 2, a trunk of 0.1 x 0.1 x 0.8 on it, a crown of radius 0.35 at 1.1; z up, off the origin."""
     side = torch.linspace(-1, 1, 41)
     ground = torch.cartesian_prod(side, side, torch.zeros(1))
-    draw = torch.Generator().manual_seed(0)
+    draw = seeded(0)
     trunk = (torch.rand(300, 3, generator=draw) - 0.5) * torch.tensor([0.1, 0.1, 0.76]) + torch.tensor([0, 0, 0.43])
     sphere = unit(800, 3, generator=draw, dtype=torch.float32)
     crown = 0.35 * sphere * torch.rand(800, 1, generator=draw) ** (1 / 3) + torch.tensor([0, 0, 1.1])
@@ -75,7 +75,7 @@ def test_origin_longest_side_and_base_are_evidence():
     # 0.75 for y down, 1 for the origin, 1.5 for a side four times the next, 0.5 for a base, which the top is too
     assert found.scores["-y"] == pytest.approx(3.75)
     assert found.scores["+y"] == pytest.approx(2.5)
-    height = torch.rand(3000, 1, generator=torch.Generator().manual_seed(0)).sqrt()
+    height = torch.rand(3000, 1, generator=seeded(0)).sqrt()
     cone = torch.cat([0.6 * height * (torch.rand(3000, 2) - 0.5), 1 - height], -1) + 5  # it does not stand on its tip
     found, _ = guess_up(Gaussians.of(plain_cloud(cone)))
     assert found.scores["+z"] - found.scores["-z"] == pytest.approx(0.75 + 1 + 0.5)
@@ -142,12 +142,12 @@ def test_region_leaves_out_floor_and_specks():
 
 
 def test_too_little_is_refused():
-    with pytest.raises(ValueError, match="too few for an object"):
+    with value_error("too few for an object"):
         guess(tree().select(torch.arange(10)))
-    with pytest.raises(ValueError, match=r"box of `--region` contains 0 Gaussians.*splat spans"):
+    with value_error(r"box of `--region` contains 0 Gaussians.*splat spans"):
         given_region(Gaussians.of(tree()), [90, 90, 90], [91, 91, 91])
     for points in (torch.ones(50, 3), (torch.arange(60) % 2).float()[:, None].expand(60, 3)):  # at one place, or two
-        with pytest.raises(ValueError, match="are at one point"):
+        with value_error("are at one point"):
             guess(plain_cloud(points))
 
 
@@ -202,7 +202,7 @@ def test_a_quality_is_a_grid_and_nothing_else():
             found["normal"].flow,
             found["normal"].size,
         )
-    with pytest.raises(ValueError, match="Expected `--quality` to be one of draft, normal, fine, but got 'best'"):
+    with value_error("Expected `--quality` to be one of draft, normal, fine, but got 'best'"):
         guess(cloud, quality="best")
 
 
@@ -238,7 +238,7 @@ def test_measures():
     cos, sin = math.cos(math.pi / 6), math.sin(math.pi / 6)
     assert broad_side(plate @ [[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]) == pytest.approx(-60, abs=2)
     assert (suggest_spacing(1.0, 0.001, 24), suggest_spacing(1.0, 0.1, 24)) == (0.042, 0.2)
-    with pytest.raises(ValueError, match="longest_side"):
+    with value_error("longest_side"):
         suggest_spacing(0.0, 0.1, 24)
 
 

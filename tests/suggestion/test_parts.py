@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from shared import value_error
 from small_scenes import GREEN, coloured, guess, plain_cloud, started
 from things import (
     AWAY,
@@ -149,7 +150,7 @@ def test_a_plant_moves_in_its_pot(tmp_path):
     last = list(simulation.frames(9))[-1]
     moved = (last.gaussians.means - simulation.scene.rest().means).norm(dim=-1) / float(size.amax())
     assert float(moved[found.parts.mask("pot") | found.parts.mask("soil")].max()) == 0.0
-    assert float(moved[found.parts.mask("leaf")].max()) > 0.01
+    assert moved[found.parts.mask("leaf")].max() > 0.01
     given = guess(cloud, up="+z", hold="bottom", quality="draft")
     assert given.parts is None
     assert given.pin is not None
@@ -207,9 +208,9 @@ def test_posts_of_a_washing_line_stand():
     line = found(cloud, by=finders.washing_line)
     assert roles(line) == [("cloth", "soft"), ("post", "still")]
     label = line.parts.labels
-    assert bool((label[:6000] == 0).all())
-    assert float((label[6000 : len(moving)] == 0).double().mean()) > 0.8  # the line, but for its ends
-    assert bool((label[len(moving) :] == 1).all())
+    assert (label[:6000] == 0).all()
+    assert (label[6000 : len(moving)] == 0).double().mean() > 0.8  # the line, but for its ends
+    assert (label[len(moving) :] == 1).all()
     suggestion = guess(cloud, up="+z")
     assert (suggestion.kind, suggestion.hold.name) == ("cloth", "top")
     assert suggestion.metres_per_unit == pytest.approx(2.5 / 2.3, rel=0.05)  # with the feet
@@ -321,7 +322,7 @@ def test_a_kind_or_a_material_may_be_given():
         ({"look": "gale"}, "`--look` to be one of breeze, gusts, storm"),
         ({"material": "slk"}, "`--material` to be one of cotton, silk"),
     ):
-        with pytest.raises(ValueError, match=words):
+        with value_error(words):
             kind(cloud, **given)
 
 

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from shared import EYE, double, value_error
 from small_captures import write_colmap, write_transforms
 from small_scenes import guess, plain_cloud
 from things import full
@@ -14,7 +15,7 @@ from gaussian_swaying.gaussians.measures import Gaussians
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.suggestion.moves import backdrops, cameras_up, read_photos, seen_share, shown_object
 
-TILT = torch.linalg.qr(torch.tensor([[1.0, 0.2, 0.1], [0.0, 1.0, -0.4], [0.3, 0.0, 1.0]], dtype=torch.float64))[0]
+TILT = torch.linalg.qr(double([[1.0, 0.2, 0.1], [0.0, 1.0, -0.4], [0.3, 0.0, 1.0]]))[0]
 TILT = TILT * torch.linalg.det(TILT)  # a rotation
 
 
@@ -24,11 +25,11 @@ def cameras(eyes, target=(0.0, 0.0, 0.0), up=(0.0, 0.0, 1.0), roll=0.0, turn=Non
     for k, eye in enumerate(eyes):
         camera = look_at_camera(list(eye), list(target), list(up), 50.0, 64, 48, dtype=torch.float64)
         angle = math.radians(roll) * (1 if k % 2 else -1)
-        about = torch.eye(4, dtype=torch.float64)
+        about = torch.eye(4).double()
         about[:2, :2] = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
         view = about @ camera.world_to_camera
         if turn is not None:
-            back = torch.eye(4, dtype=torch.float64)
+            back = torch.eye(4).double()
             back[:3, :3] = turn.T
             view = view @ back
         made.append(type(camera)(view, camera.intrinsics, camera.width, camera.height))
@@ -113,7 +114,7 @@ def test_wall_and_room_are_left_out(tmp_path):
     assert (found.hold.name, found.hold.confidence) == ("side", "medium")
     assert found.hold.direction[0] < -0.98
     held = everything[found.pin.contains(everything).numpy() & simulated]
-    assert 0 < float(held[:, 0].max()) < 0.3
+    assert 0 < held[:, 0].max() < 0.3
     assert abs(found.azimuth) < 10  # seen from where the photos were taken, not through the wall
     assert found.flow[1] == pytest.approx(3.0, abs=0.25)  # across the picture
     alone = guess(plain_cloud(everything))  # without cameras it takes in the room
@@ -134,7 +135,7 @@ def test_floor_under_what_photos_show_holds_it(tmp_path):
     assert (found.hold.name, found.hold.confidence) == ("bottom", "high")
     assert "what was left out touches its lower end" in found.hold.reasons[0]
     eyes = torch.from_numpy(read_photos(capture).eyes)  # all around
-    assert photo_azimuth(eyes, torch.zeros(3), torch.eye(3, dtype=torch.float64)) is None
+    assert photo_azimuth(eyes, torch.zeros(3), EYE) is None
 
 
 def test_what_is_no_backdrop():
@@ -148,8 +149,8 @@ def test_what_is_no_backdrop():
 
     (one,) = found(wall, head)
     assert one.normal[0] > 0.99
-    assert bool(one.behind.contains(torch.tensor([-1.0, 0.5, 0.5])))
-    assert not bool(one.behind.contains(torch.tensor([0.6, 0.0, 0.0])))
+    assert one.behind.contains(torch.tensor([-1.0, 0.5, 0.5]))
+    assert not one.behind.contains(torch.tensor([0.6, 0.0, 0.0]))
     assert found(wall) == []  # nothing in front: a sheet
     assert found(wall * torch.tensor([1.0, 0.15, 0.15]), head) == []  # no wider than what is before it
     both = np.concatenate([eyes, eyes * [-1.0, 1, 1]])
@@ -161,7 +162,7 @@ def test_cameras_that_look_elsewhere_are_refused(tmp_path):
     away = write_capture(tmp_path / "away", cameras(ring(9, 2.0), (0.0, 0.0, 900.0)))
     side = write_capture(tmp_path / "side", cameras([(float(k), 0.0, 0.0) for k in range(3)], (1e7, 0.0, 0.0)))
     for folder, words in ((away, "splat has 0 Gaussians"), (side, "do not look at a common point.*set `--region`")):
-        with pytest.raises(ValueError, match=words):
+        with value_error(words):
             shown_object(everything, read_photos(folder))
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from shared import beyond, peak, seeded, up_to
 from small_scenes import guess, plain_cloud, started, together
 
 from gaussian_swaying.config.parser import parse_text
@@ -36,12 +37,12 @@ from gaussian_swaying.suggestion.picture import (
 from gaussian_swaying.suggestion.suggestion import region_dict
 from gaussian_swaying.wind.field import FlowKey, WindField
 
-POLE = Box([None, None, None], [0.11, None, None])
+POLE = up_to(x=0.11)
 
 
 def column(count=3000, side=0.3, height=2.0):
     """A square column on the origin, z up."""
-    points = torch.rand(count, 3, generator=torch.Generator().manual_seed(0))
+    points = torch.rand(count, 3, generator=seeded(0))
     return (points - torch.tensor([0.5, 0.5, 0.0])) * torch.tensor([side, side, height])
 
 
@@ -76,9 +77,9 @@ def test_camera_of_the_starter_shows_all_of_it(tmp_path):
         simulation = started(found, cloud, tmp_path)
         camera = simulation.painter.camera_at(0)
         pixel, depth = project(cloud.means[cloud.means[:, 2] >= below], camera)
-        assert float(depth.min()) > 0
+        assert depth.min() > 0
         edge = torch.tensor([camera.width, camera.height]) - pixel
-        assert float(torch.minimum(pixel, edge).min()) > 0.05 * camera.height  # room to sway
+        assert torch.minimum(pixel, edge).min() > 0.05 * camera.height  # room to sway
         assert float(pixel[:, 1].amax() - pixel[:, 1].amin()) > 0.5 * camera.height  # and yet large
         low, _ = _whole(simulation, classify(simulation))  # as a preview of this configuration has it
         assert low == pytest.approx(found.whole[0], abs=0.05)
@@ -97,7 +98,7 @@ def test_floor_is_not_framed(make_simulation):
     flag, side = FlagScene(spacing=0.1).generate(), torch.arange(-3, 3.01, 0.1)
     floor = torch.cartesian_prod(side, side, torch.tensor([-0.1]))
     cloud = together(flag, plain_cloud(floor, torch.tensor([0.08, 0.08, 0.001]).log()))
-    simulation = make_simulation(cloud=cloud, scene={"region": Box([None, None, 0.0], [None, None, None])})
+    simulation = make_simulation(cloud=cloud, scene={"region": beyond(z=0.0)})
     low, high = _whole(simulation, classify(simulation))
     assert low == pytest.approx(flag.means.amin(0).tolist(), abs=1e-5)
     assert high == pytest.approx(flag.means.amax(0).tolist(), abs=1e-5)
@@ -126,7 +127,7 @@ def test_lines_are_where_the_renderer_draws():
     image = render_torch(point, 1e-6 * torch.eye(3)[None], torch.ones(1), torch.ones(1, 3), camera)
     row, line = divmod(int(image.alpha[..., 0].argmax()), 64)
     pixel, depth = project(point, camera)
-    assert float((pixel[0] - torch.tensor([line + 0.5, row + 0.5])).abs().max()) <= 0.5 + 1e-6
+    assert peak(pixel[0] - torch.tensor([line + 0.5, row + 0.5])) <= 0.5 + 1e-6
     assert float(depth) == pytest.approx(float(image.depth.max() / image.alpha.max()), rel=1e-5)
     view = View(torch.ones(1, 3), (point, 1e-6 * torch.eye(3)[None], torch.ones(1)), camera)
     view.box(np.array([-0.5, -9.0, -0.4]), np.array([0.5, 0.0, 0.4]), REGION)
@@ -137,12 +138,12 @@ def test_lines_are_where_the_renderer_draws():
 
 
 def test_parts_are_those_of_the_run(make_simulation):
-    boundaries = [PinnedRegion(POLE), Impulse(Box([0.8, None, None], [None, None, None]), [0, 0, 1]),
+    boundaries = [PinnedRegion(POLE), Impulse(beyond(x=0.8), [0, 0, 1]),
                   Plane([0, 0, -9], [0, 0, 1])]  # fmt: skip
     cloud = FlagScene(spacing=0.1).generate()
     cloud.opacities[-8:] = -6.0  # the last column is faint
     simulation = make_simulation(cloud=cloud, pinned=False, boundaries=boundaries, scene={"region": Not(
-        Box([None, None, 0.6], [None, None, None]))})  # fmt: skip
+        beyond(z=0.6))})  # fmt: skip
     roles, (x, _, z) = classify(simulation), cloud.means.unbind(-1)
     assert torch.equal(roles.simulated, (z < 0.6) & (x < 1.1))
     assert torch.equal(roles.carried, (z < 0.6) & (x > 1.1))
@@ -200,7 +201,7 @@ def test_region_survives_the_yaml(region):
     back = parser.instantiate(parser.parse_string(text)).region
     points = 3 * torch.rand(500, 3) - 0.5
     assert torch.equal(back.contains(points), region.contains(points))
-    assert bool(region.contains(points).any())
+    assert region.contains(points).any()
     with pytest.raises(TypeError, match="but got Everything"):
         region_dict(Everything())
 

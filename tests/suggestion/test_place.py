@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from places import place
-from shared import unit
+from shared import unit, value_error
 from small_scenes import guess, plain_cloud, together, turned_cloud
 
 from gaussian_swaying import suggest
@@ -193,5 +193,5 @@ def test_the_suggestion_for_a_place(garden, tmp_path):
     ],
 )
 def test_bad_choices_are_refused(garden, options, words):
-    with pytest.raises(ValueError, match=words):
+    with value_error(words):
         guess(garden[0], **options)

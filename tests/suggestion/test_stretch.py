@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from shared import double
 
 from gaussian_swaying.suggestion import stretch
 from gaussian_swaying.suggestion.stretch import cloth_motion, rate_for, typical_start
@@ -93,7 +94,7 @@ def test_places_on_one_line_meet_the_same_wind_one_after_the_other():
     pull[0, 0, 0] = pull[1, 0, 1] = 1.0
     push = stretch._push(wind, places, pull, 25.0)
     np.testing.assert_allclose(push[5:, 1], push[:-5, 0], rtol=1e-4)  # 1.6 m in 5 samples at 8 m/s
-    air = wind.at(torch.tensor(4.0, dtype=torch.float64), torch.from_numpy(places[:1]).float())[0].double()
+    air = wind.at(double(4.0), torch.from_numpy(places[:1]).float())[0].double()
     assert push[100, 0] == pytest.approx(float(air.norm() * air[0]), rel=1e-3)
 
 

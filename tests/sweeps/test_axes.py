@@ -1,6 +1,7 @@
 """Axes of a sweep, and the runs that they make."""
 
 import pytest
+from shared import value_error
 
 from gaussian_swaying.config.parser import option
 from gaussian_swaying.sweeps.plan import read_axis, runs_of
@@ -77,16 +78,16 @@ def test_each_combination_is_drawn():
     ],
 )
 def test_bad_axes(given, words):
-    with pytest.raises(ValueError, match="axes") as error:
+    with value_error("axes") as error:
         read_axis("E", given)
     for word in words:
         assert word in str(error.value)
 
 
 def test_too_many_runs_and_nothing_to_draw():
-    with pytest.raises(ValueError, match="1,000,000 runs"):
+    with value_error("1,000,000 runs"):
         _runs({name: list(range(100)) for name in "abc"})
-    with pytest.raises(ValueError, match="set `draws` to 1"):
+    with value_error("set `draws` to 1"):
         _runs({"a": [1, 2]}, draws=3)
 
 

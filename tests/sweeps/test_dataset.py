@@ -4,9 +4,9 @@ import json
 import shutil
 
 import numpy as np
-import pytest
 import torch
 from PIL import Image
+from shared import value_error
 from torch.utils.data import DataLoader
 
 from gaussian_swaying.recording.nodes import load_nodes
@@ -72,10 +72,10 @@ def test_what_was_not_recorded_is_told(undisturbed, tmp_path):
     folder = _small_copy(undisturbed, tmp_path / "some")
     for wanted, setting in (("frames", "images"), ("positions", "trajectory"), ("nodes", "nodes")):
         data = SweepDataset(folder, **{"frames": False, wanted: True})
-        with pytest.raises(ValueError, match=f"leave out `{wanted}`, or sweep with recorder.{setting}"):
+        with value_error(f"leave out `{wanted}`, or sweep with recorder.{setting}"):
             data[0]
-    with pytest.raises(ValueError, match=r"not the folder of a sweep"):
+    with value_error(r"not the folder of a sweep"):
         SweepDataset(tmp_path)
     shutil.rmtree(folder / "results")
-    with pytest.raises(ValueError, match=r"finish it with --resume"):
+    with value_error(r"finish it with --resume"):
         SweepDataset(folder)

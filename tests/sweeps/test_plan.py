@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 import yaml
+from shared import value_error
 
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.scenes.procedural import FlagScene
@@ -102,7 +103,7 @@ def test_the_sweep_of_the_page(tmp_path, parser):
 def test_bad_sweep_files(tmp_path, sweep_file, change, words):
     path = sweep_file(tmp_path / "a.yaml")
     path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | change, sort_keys=False))
-    with pytest.raises(ValueError, match="`") as error:
+    with value_error("`") as error:
         read_sweep(path)
     for word in words:
         assert word in str(error.value)
@@ -112,7 +113,7 @@ def test_bad_sweep_files(tmp_path, sweep_file, change, words):
 @pytest.mark.parametrize("text", ["axes: [", "- 1", "", "just text"])
 def test_files_that_are_no_sweep(tmp_path, text):
     (tmp_path / "a.yaml").write_text(text)
-    with pytest.raises(ValueError, match=r"a\.yaml"):
+    with value_error(r"a\.yaml"):
         read_sweep(tmp_path / "a.yaml")
 
 

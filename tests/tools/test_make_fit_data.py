@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from shared import near
 
 from gaussian_swaying import Simulation
 
@@ -50,7 +51,7 @@ def test_scenes_can_be_simulated_and_hold_the_right_edge(cases, tmp_path):
         spacing = settings["scene"]["generator"]["init_args"]["spacing"]
         assert 0.045 < spacing <= 0.05
         assert len(held) == round((pattern.width if axis == 2 else pattern.height) / spacing)
-        torch.testing.assert_close(held[:, axis], torch.full((len(held),), line), atol=1e-5, rtol=0)
+        near(held[:, axis], torch.full((len(held),), line), 1e-5)
 
 
 def test_noise_has_the_strength_that_is_asked_for_and_is_repeatable(cases, videos):

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from shared import value_error
 
 from gaussian_swaying.captures.capture import read_capture
 from gaussian_swaying.rendering.cameras.camera_path import TransformsCamera
@@ -89,7 +90,7 @@ def test_steps_follow_the_mesh(reference, cloth):
         assert reference.least_quality(finer) == 4 * pattern.quality
     pattern = reference.PATTERNS[3]
     grid, rough = pattern.grid(), replace(pattern, quality=8).run()
-    with pytest.raises(ValueError, match="`quality` of at least 38"):
+    with value_error("`quality` of at least 38"):
         cloth.solve_cloth(grid, grid.flat(), [], pattern.material(), rough)
 
 
@@ -122,14 +123,14 @@ def test_motion_is_solved_once_and_says_what_changed(reference, flag_motion, mon
         assert str(data["hash"]) == flag_motion.settings_hash(motion.settings)
         np.testing.assert_array_equal(data["pins"], pattern.pins(motion.uv))
     changed = replace(pattern, quality=16, drag=1.0)
-    with pytest.raises(ValueError, match=r"`drag` was 0.8 and is now 1.0; `quality` was 8 and is now 16"):
+    with value_error(r"`drag` was 0.8 and is now 1.0; `quality` was 8 and is now 16"):
         flag_motion.solve_pattern(changed, path)
     assert calls == [8]
 
 
 def _seen(fields_path, frame, points):
     """Pixels at which a camera of this package sees points."""
-    camera = TransformsCamera(fields_path, frame)(0, 0.0, torch.zeros(3, dtype=torch.float64), torch.zeros(3), 1.0)
+    camera = TransformsCamera(fields_path, frame)(0, 0.0, torch.zeros(3).double(), torch.zeros(3), 1.0)
     local = points @ camera.world_to_camera[:3, :3].T.numpy() + camera.world_to_camera[:3, 3].numpy()
     image = local @ camera.intrinsics.numpy().T
     return image[:, :2] / image[:, 2:], local[:, 2]
@@ -199,7 +200,7 @@ def test_training_views_are_a_capture_and_are_continued(tool, small, monkeypatch
     capture = read_capture(folder / "train")
     assert len(capture.views) == 9
     assert tuple(capture.views[0].load().shape) == (16, 16, 4)
-    with pytest.raises(ValueError, match="`samples` was 1 and is now 2"):
+    with value_error("`samples` was 1 and is now 2"):
         tool.make_train(pattern, folder / "train", replace(pictures, samples=2), lambda line: None)
 
 
