@@ -35,7 +35,7 @@ def test_a_shipped_sweep_by_name(tmp_path, monkeypatch, capsys):
     refused(main, ["flag_wind"], capsys, "'flag_wind' (did you mean flag_winds?)", folder=tmp_path)
 
 
-@pytest.mark.parametrize(("extra", "module"), [("parquet", "record"), ("ray", "ray_backend")])
+@pytest.mark.parametrize(("extra", "module"), [("parquet", "record"), ("ray", "run")])
 def test_a_missing_extra_leaves_nothing_behind(extra, module, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(f"gaussian_swaying.sweeps.{module}.find_spec", lambda name: None)
     file = _file(tmp_path / "a.yaml", axes={"material.E": [1e3, 2e3]})

@@ -49,8 +49,12 @@ def test_the_configuration_comes_back_and_changes_are_undone(page, client):
     held = controls.holding.places()
     assert len(held) > 5
     assert abs(held[:, 0]).max() < 0.03  # the pole
-    client.set(controls.light, 90.0)
-    until(lambda: session.settings.shader.init_args.light[0] == pytest.approx(0.0, abs=1e-3))
+
+    def lit_from_the_side():
+        client.set(controls.light, 90.0)  # again, if the controls were still being put back
+        return session.settings.shader.init_args.light[0] == pytest.approx(0.0, abs=1e-3)
+
+    until(lit_from_the_side)
     assert session.settings.shader.init_args.light[1] > 0.1
 
 
