@@ -56,11 +56,28 @@ def test_gather_is_the_adjoint_of_scatter(device):
     assert_close(left, (gather(field, stencil) * coefficients).sum())
 
 
+def test_gradient_rows_match_autograd():
+    position = _particles("cpu", torch.float64, count=5)[0].requires_grad_()
+    field = torch.rand(GRID.node_count, 1, dtype=torch.float64)
+    rows = gather(field, bspline_stencil(position, GRID))
+    (gradient,) = torch.autograd.grad(rows[:, 0].sum(), position)
+    assert_close(rows[:, 1:4, 0], gradient)
+
+
 def test_moved_grid_gives_the_same_weights():
     """Every grid is a window of the same lattice, so a grid that follows the object changes nothing."""
     position = _particles("cpu", torch.float32)[0]
     a, b = bspline_stencil(position, GRID), bspline_stencil(position, GridSpec(DX, (-3, -1, -2), (20, 15, 17)))
     assert torch.equal(a.basis, b.basis)
+
+
+def test_batch_scenes_do_not_touch():
+    position, mass, velocity, affine = _particles("cpu", torch.float64, 3)
+    together = p2g(mass, velocity, affine, bspline_stencil(position, GRID))
+    for b in range(3):
+        alone = p2g(mass[b], velocity[b], affine[b], bspline_stencil(position[b], GRID))
+        assert_close(together[0][b], alone[0], rtol=0, atol=1e-14)
+        assert_close(together[1][b], alone[1], rtol=0, atol=1e-14)
 
 
 def test_snap_leaves_no_vanishing_weight():

@@ -283,6 +283,16 @@ def test_a_state_is_saved_and_read():
     assert solver.continued(solver, state, start) is not None
 
 
+def test_gradients_come_from_torch():
+    position, number = together(sheet(3.1, 1, 2), sheet(3.3, 1, 2))
+    points = material(position, number)
+    modulus = points.youngs_modulus.clone().requires_grad_()
+    solver = MPMSolver(1.0, boundaries=[PinnedRegion(EDGE)])
+    state = solver.init_state(dataclasses.replace(points, youngs_modulus=modulus))
+    solver.rollout(state, 1e-2, 5).position.sum().backward()
+    assert modulus.grad.abs().amax() > 0
+
+
 def test_close_parts_touch_and_do_not_pass_each_other():
     """Sheets with a gap of 0.4 cells that are pushed together; on shared nodes they would be one body."""
     position, number = together(sheet(3.1), sheet(3.5))

@@ -315,6 +315,16 @@ def test_of_two_boundaries_at_the_same_place_the_last_one_counts():
         assert_close(found, double([[0.0, speed, 0.0]]).expand_as(found))
 
 
+def test_a_pin_that_opens_lets_go():
+    pin = PinnedRegion(TOP, end=0.0055)
+    solver = MPMSolver(DX, boundaries=[pin])
+    state = _run(solver, _sheet(), 5, every=5)[-1]
+    places = _own_places(solver)
+    for _ in range(3):
+        state = solver.step(state, 1e-3)
+    assert bool((_read(places, state)[:, 0, 2] < -0.015).all())
+
+
 def test_pins_act_within_their_windows():
     """One from the start, one for some time, one that starts later: three phases and two releases."""
     points = _sheet()
@@ -574,6 +584,18 @@ def _material(rest):
 
 
 # ---- the face
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.7])
+def test_the_face_lies_between_held_and_free_points(turn):
+    rest = _box(6, 1, 2)
+    held = rest[:, 0] < 0.2
+    place, across = face(_box(6, 1, 2, turn=turn), held, DX)
+    c, s = math.cos(turn), math.sin(turn)
+    normal = double([c, 0.0, s])
+    assert len(place) == 4 * 8  # each held point of the last layer has its partner
+    near(place @ normal, torch.full((32,), 0.2, dtype=torch.float64), 1e-12)
+    near(across, normal.expand_as(across), 1e-12)
 
 
 def test_what_is_far_apart_has_no_face():
