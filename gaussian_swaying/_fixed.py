@@ -1,7 +1,7 @@
 """Settings stay as they were made, so that the record of a run says what ran: assigning to them is an error.
 
 A class of the package refuses every public name; one of a user's own those that it has from the package. What may
-change is counted (:func:`version`), so that a recording knows whether it is still valid.
+change is counted (:func:`count_change`), so that a recording knows whether it is still valid.
 """
 
 from __future__ import annotations
@@ -23,19 +23,12 @@ from gaussian_swaying._arguments import check_arguments
 T = TypeVar("T")
 LIVE: set[str] = set()
 """Names of the numbers that ``Simulation.change`` changes."""
-_changes = count()
-_version = next(_changes)
+_changes = count(1)
 
 
-def version() -> int:
-    """A number that is another one after any change of a setting that was made; tensors can change without."""
-    return _version
-
-
-def count_change() -> None:
-    """Give :func:`version` another value."""
-    global _version
-    _version = next(_changes)
+def count_change(thing: Any) -> None:
+    """Mark an object as changed, so that what was recorded of it is recorded again."""
+    vars(thing)["_changed"] = next(_changes)
 
 
 class Fixed:
@@ -68,17 +61,18 @@ class Fixed:
     def __setattr__(self, name: str, value: Any) -> None:
         _check(self, name, value)
         counts = "_made" in vars(self) and name[0] != "_" and name not in ("training", *self.assignable)
-        if counts and getattr(self, name, LIVE) is not value:
-            count_change()
+        counts = counts and getattr(self, name, LIVE) is not value
         if _settable(self, name):  # a module would become a part of another without passing the setter
             object.__setattr__(self, name, value)
         else:
             super().__setattr__(name, value)
+        if counts:
+            count_change(self)
 
     def __delattr__(self, name: str) -> None:
         _check(self, name)
-        count_change()
         super().__delattr__(name)
+        count_change(self)
 
 
 def fixed(kind: type[T]) -> type[T]:
@@ -206,7 +200,7 @@ def assign(thing: Any, **values: Any) -> None:
             setattr(thing, name, value)
     finally:
         if made:
-            count_change()
+            count_change(thing)
             vars(thing)["_made"] = True
 
 

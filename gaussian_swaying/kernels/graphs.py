@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import gc
 import threading
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from typing import Any
 
 import torch
 from torch import nn
 
-from gaussian_swaying._fixed import Fixed, version
+from gaussian_swaying._fixed import Fixed
 from gaussian_swaying.kernels.language import INTERPRETED
 from gaussian_swaying.kernels.launch import call
 
@@ -56,20 +56,24 @@ class Component(Fixed):
 def recorded_key(modules: Sequence[nn.Module]) -> tuple[object, ...]:
     """What a recording of modules depends on: other objects, addresses of tensors or settings need another recording.
 
-    What is in the tensors is read at each replay. A change inside an object that is neither a module nor a setting is
-    not detected.
+    What is in the tensors is read at each replay. An assignment to a module that is no ``Fixed`` is not detected, nor
+    one within another object.
     """
-    return (version(), *modules, *((tensor.data_ptr(), tensor.shape) for tensor in tensors_in(modules)))
+    changes = (vars(part).get("_changed", 0) for part in _parts(modules))
+    return (*modules, *changes, *((tensor.data_ptr(), tensor.shape) for tensor in tensors_in(modules)))
 
 
 def tensors_in(modules: Iterable[nn.Module]) -> list[torch.Tensor]:
     """All parameters and buffers of modules, many times faster than ``parameters()`` and ``buffers()``."""
-    found: list[torch.Tensor] = []
+    held = ((vars(part)["_parameters"], vars(part)["_buffers"]) for part in _parts(modules))
+    return [tensor for pair in held for own in pair for tensor in own.values() if tensor is not None]
+
+
+def _parts(modules: Iterable[nn.Module]) -> Iterator[nn.Module]:
+    """Yield modules, each followed by all that it contains."""
     for module in modules:
-        own = vars(module)
-        found += [t for t in (*own["_parameters"].values(), *own["_buffers"].values()) if t is not None]
-        found += tensors_in(child for child in own["_modules"].values() if child is not None)
-    return found
+        yield module
+        yield from _parts(child for child in vars(module)["_modules"].values() if child is not None)
 
 
 class Replayed:

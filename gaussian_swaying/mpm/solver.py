@@ -178,7 +178,7 @@ class MPMSolver(Fixed, Solver):
 
     def prepare(self) -> None:
         """Make the kernels, if they are used; their errors are raised here."""
-        assert self.kernels is not None or not self.has_kernels
+        _ = self.kernels
 
     def like(self, settings: Settings) -> MPMSolver:
         """A solver with the same boundaries and other numbers, without a material.
@@ -252,7 +252,7 @@ class MPMSolver(Fixed, Solver):
         bound = FORMULATIONS[self.formulation](points, boundaries, self.settings, surface)
         self._obstacle = self._why_not_kernels(bound)
         self._bound = bound
-        count_change()
+        count_change(self)
 
     def _choice(
         self, points: MaterialPoints, boundaries: Sequence[Boundary], surface: Surface | None

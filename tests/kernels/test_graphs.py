@@ -62,7 +62,7 @@ def test_what_makes_a_recording_invalid():
     gust.share, gust._known = gust.share, 2.0
     gust.eval()
     changed(gust, delta=0.1)
-    Own(0.3)
+    assign(Own(0.3), delta=0.4)
     assert recorded_key([gust]) == before
     for change in (
         lambda: setattr(gust, "share", 2.0),
