@@ -188,10 +188,10 @@ def test_kernels_do_what_torch_does(kernel_device, scene):
 
     On a CPU in double precision but for numbers like friction: both compute the same formulas.
     """
-    formulation, laws, boundaries, aero, more = scene
+    formulation, names, boundaries, aero, more = scene
     more = dict(more)
     groups, batch, count = more.pop("groups", False), more.pop("batch", ()), more.pop("count", 24)
-    laws = [(ELASTIC | PLASTIC)[law] for law in laws.split(", ")]
+    laws = [(ELASTIC | PLASTIC)[law] for law in names.split(", ")]
     index = torch.randint(len(laws), (count,), generator=seeded(6)) if len(laws) > 1 else None
     rates = 40 * torch.rand(count, generator=seeded(1)) if more.pop("rates", False) else None
     bends = {}
@@ -217,7 +217,9 @@ def test_kernels_do_what_torch_does(kernel_device, scene):
     make = (BOUNDARIES | POINT_HOLDS | OTHERS)[boundaries]
     start = _settled if bends or boundaries == "rigid part" else set_going
     ends = run_both(points, run, formulation, start, boundaries=make(), **more)
-    check_agreement(ends, TOLERANCE if kernel_device.type == "cuda" else 1e-8)
+    # snow hardens by exp(10 (1 - J)); against double precision, torch's velocity is off by 1.1e-5, the kernels' by 2e-5
+    single = 4e-5 if names == "snow" else TOLERANCE
+    check_agreement(ends, single if kernel_device.type == "cuda" else 1e-8)
     if laws[0].plastic and boundaries == "none":
         assert peak(ends[1][1].F_elastic - ends[1][1].F_total) > 0.01
     if aero is None:
