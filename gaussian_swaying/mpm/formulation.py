@@ -147,6 +147,10 @@ class Formulation(ABC):
             found |= held.mass > 0
         return found
 
+    def restiffened(self, points: MaterialPoints) -> Formulation | None:
+        """The same body with points of another stiffness; None if it must be bound anew."""
+        return None
+
     def tensors(self) -> list[Tensor]:
         """Tensors that a substep depends on, besides its state and forces; any of them may require a gradient."""
         points = self.points

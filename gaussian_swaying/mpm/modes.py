@@ -73,9 +73,12 @@ class Modes(Total):
         if why is not None:
             raise ValueError(f"`solver.formulation: modes` is for a held body that sways about its rest, but {why}.")
         super().__init__(points, boundaries, settings, surface)
-        scenes = max(1, math.prod(points.mass.shape[:-1]))
-        with torch.no_grad():
-            self._bind([analysis_of(self, scene, MOST_MODES) for scene in range(scenes)])
+        self.analyse()
+
+    @torch.no_grad()
+    def analyse(self) -> None:
+        scenes = max(1, math.prod(self.points.mass.shape[:-1]))
+        self._bind([analysis_of(self, scene, MOST_MODES) for scene in range(scenes)])
 
     def _bind(self, found: Sequence[Analysis]) -> None:
         points, batch, count = self.points, tuple(self.points.mass.shape[:-1]), self.points.count
@@ -130,6 +133,14 @@ class Modes(Total):
         self.dropped = max(one.dropped for one in found)
         self._site_forces: Any = None
         self._forces: WeakKeyDictionary[Force, Force | None] = WeakKeyDictionary()
+
+    def restiffened(self, points: MaterialPoints) -> Modes | None:
+        other = super().restiffened(points)
+        if isinstance(other, Modes):
+            for name in ("_shares", "ratio"):
+                vars(other).pop(name, None)
+            other.analyse()
+        return other  # type: ignore[return-value]
 
     # ---- numbers that may have a gradient
 

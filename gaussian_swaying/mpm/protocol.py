@@ -115,6 +115,18 @@ class Solver(nn.Module, ABC):
     def prepare(self) -> None:
         """Compile what is needed; its errors are raised here."""
 
+    def restiffen(self, youngs_modulus: Tensor, poisson_ratio: Tensor) -> bool:
+        """Give the material another stiffness, while a motion goes on.
+
+        Args:
+            youngs_modulus: Young's modulus [Pa], shape (..., P).
+            poisson_ratio: Poisson's ratio, shape (..., P).
+
+        Returns:
+            False if nothing was done, as :meth:`init_state` has to take such a material.
+        """
+        return False
+
     def like(self, settings: Any) -> Self:
         """A solver with the same boundaries and other :attr:`settings`, without a material."""
         raise ValueError(f"{type(self).__name__} has no other settings: give it a method `like`.")

@@ -180,6 +180,18 @@ class MPMSolver(Fixed, Solver):
         """Make the kernels, if they are used; their errors are raised here."""
         _ = self.kernels
 
+    def restiffen(self, youngs_modulus: Tensor, poisson_ratio: Tensor) -> bool:
+        points = dataclasses.replace(self.points, youngs_modulus=youngs_modulus, poisson_ratio=poisson_ratio)
+        bound = self.bound.restiffened(points)
+        if bound is None:
+            return False
+        if self._kernels is not None:
+            with torch.inference_mode(False), torch.no_grad():
+                self._kernels.restiffen(bound)
+        self._bound = bound
+        count_change(self)
+        return True
+
     def like(self, settings: Settings) -> MPMSolver:
         """A solver with the same boundaries and other numbers, without a material.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -105,7 +106,7 @@ class Total(Formulation):
         )
         self.rigid_bodies = [self._body(k) for k in self.rigid]
         self._check_bodies()
-        softened = self._soften()
+        softened = self.soften()
         self.bending = bending_of(points, self.stencil, settings.dx, softened)
         if self.bending is not None:
             assert points.bending is not None
@@ -114,6 +115,15 @@ class Total(Formulation):
             self.bending_rate = self.bending.fastest(self.node_inverse_mass)
         self.pinned_rows = self._pinned_rows()
         self.contact = self._contact()
+
+    def restiffened(self, points: MaterialPoints) -> Total | None:
+        if self.bending is not None:
+            return None
+        other = copy.copy(self)
+        vars(other).pop("longest_substep", None)
+        other.points, other.laws = points, LawDispatch(points)
+        other.soften()
+        return other
 
     def _summed(self, values: Tensor) -> Tensor:
         """Sums of values of the particles (..., P, K) by nodes (..., G, K); also on a GPU in a fixed order."""
@@ -140,7 +150,7 @@ class Total(Formulation):
     def hold_kind(self, k: int) -> str:
         return kind_in_total(self, k)
 
-    def _soften(self) -> Tensor | None:
+    def soften(self) -> Tensor | None:
         """Reduce the stiffness of material that clamps hold all the time; return the factors (``pins.SOFTENED``).
 
         None if there is none.
@@ -503,6 +513,12 @@ class TotalRun(Run):
     @property
     def launches(self) -> bool:
         return self.plain and (self.touching is None or None not in self.touching.solids)
+
+    def restiffen(self, bound: Total) -> None:
+        """Take a body of another stiffness; what was recorded stays."""
+        self.bound = bound
+        for row, values in zip(self.material[1:3], (bound.laws.mu, bound.laws.lam), strict=True):
+            row.copy_(values.reshape(-1)[self.order.long()])
 
     def _take_sheets(self) -> None:
         """The sheets that bend by themselves: the normals of their points, and their matrices."""

@@ -8,6 +8,7 @@ import warnings
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import fields
 from typing import NoReturn
 
 import torch
@@ -205,6 +206,7 @@ class Stepper:
         self._joints: tuple[tuple[object, ...], Joints] | None = None
         self._materials: dict[tuple[int, int, float], tuple[MaterialPoints, Tensor, MaterialPoints]] = {}
         self._bound: tuple[MaterialPoints, ...] = ()
+        self._rest: State | None = None
         self.lift: AirLift | None = None
         self._air: AirInBox | None = None
         self._tearing: TearingGauge | None = None
@@ -408,6 +410,20 @@ class Stepper:
         self.solver.prepare()
         self.solver.substeps(rehearsed, self.frame_dt)
 
+    def _restiffened(self) -> bool:
+        """Give the solver the material if it has another stiffness, and nothing else has changed."""
+        before, now, stiffness = self._bound, self.materials, ("youngs_modulus", "poisson_ratio")
+        others = [field.name for field in fields(MaterialPoints) if field.name not in stiffness]
+        if len(before) != len(now) or any(
+            getattr(a, name) is not getattr(b, name) for a, b in zip(before, now, strict=True) for name in others
+        ):
+            return False
+        each = [[getattr(points, name) for points in now] for name in stiffness]
+        if not self.solver.restiffen(*(torch.stack(values) if self.batched else values[0] for values in each)):
+            return False
+        self._bound = now
+        return True
+
     def bind(self) -> State:
         """Bind the solver to the material; returns the state at rest."""
         scene, self._bound = self.scene, self.materials
@@ -418,7 +434,7 @@ class Stepper:
             if why is not None:
                 self.solver.rule_out_modes(why)
                 state = self.solver.init_state(points, frame=scene.frame, surface=scene.surface_places)
-        self.lift = None
+        self.lift, self._rest = None, state
         if any(model.aero.carried for model in self.models) and any(self.solver.gravity):
             with torch.inference_mode(False), torch.no_grad():  # it outlives the call
                 air = [carried_mass(model.scene.patches, model.aero) for model in self.models]
@@ -478,8 +494,10 @@ class Stepper:
         kept = len(self._bound) == len(self.models) and all(map(operator.is_, self._bound, self.materials))
         if not running or (kept and model.solver is before.solver):
             return None
-        rest = self.bind()
-        self.solver.prepare()
+        if model.solver is not before.solver or not self._restiffened():
+            self.bind()
+            self.solver.prepare()
+        rest = self._rest
         steps = min(MAX_GROWTH * self.solver.substeps(rest, self.frame_dt), MAX_SUBSTEPS)
         self.most_substeps = max(self.most_substeps, steps)
         if self._tearing is not None:

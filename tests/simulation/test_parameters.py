@@ -12,14 +12,17 @@ from small_films import base
 
 from gaussian_swaying.fitting.report import scene_text
 from gaussian_swaying.fitting.unknowns import Unknown, check_unknowns, read_plan, states_of
+from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.scenes.solid import SolidScene
 from gaussian_swaying.simulation.body import Material, Scene
-from gaussian_swaying.simulation.model import Edit, in_settings, names, number, of_settings
+from gaussian_swaying.simulation.model import Copy, Edit, in_settings, names, number, of_settings
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep
 from gaussian_swaying.sweeps.run import grouped
 from gaussian_swaying.viewer.session import Session, changed_settings
+from gaussian_swaying.wind.force import AeroForce
 
 CONFIG = base(frames=3)
 CONFIG["solver"]["damping"] = 0.5
@@ -157,6 +160,48 @@ def test_gradients_are_kept(name, config):
     total = total + points.poisson_ratio.double().sum() + aero.C_D + aero.C_F + aero.C_L
     (slope,) = torch.autograd.grad(total, value)
     assert slope.abs() > 0
+
+
+def _stiffened(monkeypatch, bound_anew, scene, **more):
+    """Positions after a change of the stiffness in motion, and how often the solver took a material."""
+    taken = []
+    with monkeypatch.context() as patched:
+        take = MPMSolver.init_state
+        patched.setattr(MPMSolver, "init_state", lambda *args, **given: taken.append(1) or take(*args, **given))
+        if bound_anew:
+            patched.setattr(MPMSolver, "restiffen", lambda *_: False)
+        simulation = Simulation(scene, wind=[4, 0, 0], device="cpu", **more)
+        state, _ = simulation.advance(simulation.start())
+        simulation.change({"material.E": 3e4, "material.nu": 0.1})
+        for _ in range(2):
+            state, _ = simulation.advance(state)
+        simulation.change("material.E", 2e4)
+        state, _ = simulation.advance(state)
+    return state.position, len(taken)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["hinge", "clamp", "torch", "modes", "copies", "carried air", pytest.param("updated", id="updated: bound anew")],
+)
+def test_a_stiffness_that_changes_in_motion(kind, monkeypatch):
+    """Bit by bit what a solver that takes the material anew does; and in ``total`` none has to."""
+    kind_of_pin = {"clamp": "clamp", "modes": "clamp", "updated": "nodes"}.get(kind, "hinge")
+    pin = PinnedRegion(up_to(x=-0.8 if kind == "modes" else 0.11), kind=kind_of_pin)
+    formulation = kind if kind in ("modes", "updated") else "total"
+    transfer = "torch" if kind == "torch" else "auto"
+    scene = SolidScene("box", 2.0, spacing=0.1) if kind == "modes" else FlagScene(spacing=0.1)
+
+    def found(anew):
+        solver = MPMSolver(0.2, formulation, boundaries=[pin], transfer=transfer, gravity=(0, 0, 0))
+        more = {"copies": [Copy(), Copy(shift=(2.0, 0.0, 0.0), delay=0.3)]} if kind == "copies" else {}
+        more |= {"aero": AeroForce(added_mass=0.05)} if kind == "carried air" else {}
+        return _stiffened(monkeypatch, anew, scene, solver=solver, **more)
+
+    (expected, anew), (position, once) = found(True), found(False)
+    assert torch.equal(position, expected)
+    assert anew >= 3
+    assert once == (3 if kind in ("updated", "carried air") else 1)
 
 
 def test_a_gradient_that_would_be_lost_is_refused(config):
