@@ -36,7 +36,7 @@ from .simulation.draw import Frame as Frame
 from .simulation.measure import SimulationDiverged as SimulationDiverged
 from .simulation.model import Copy as Copy
 from .simulation.model import Edit as Edit
-from .simulation.model import Live as Live
+from ._live import Live as Live
 from .simulation.simulation import Simulation as Simulation
 from .suggestion.suggest import suggest as suggest
 from .training.data.datamodule import CaptureDataModule as CaptureDataModule

@@ -21,8 +21,7 @@ from torch import nn
 from gaussian_swaying._arguments import check_arguments
 
 T = TypeVar("T")
-LIVE: set[str] = set()
-"""Names of the numbers that ``Simulation.change`` changes."""
+_ABSENT = object()
 _changes = count(1)
 
 
@@ -61,7 +60,7 @@ class Fixed:
     def __setattr__(self, name: str, value: Any) -> None:
         _check(self, name, value)
         counts = "_made" in vars(self) and name[0] != "_" and name not in ("training", *self.assignable)
-        counts = counts and getattr(self, name, LIVE) is not value
+        counts = counts and getattr(self, name, _ABSENT) is not value
         if _settable(self, name):  # a module would become a part of another without passing the setter
             object.__setattr__(self, name, value)
         else:
@@ -150,7 +149,7 @@ def _refuses(thing: Any, name: str) -> bool:
 def _check(thing: Any, name: str, *value: object) -> None:
     """Refuse a value, unless it is there, as after an operation in place; or that the name is deleted."""
     fresh = not value or isinstance(getattr(type(thing), name, None), property)
-    if _refuses(thing, name) and (fresh or getattr(thing, name, LIVE) is not value[0]):
+    if _refuses(thing, name) and (fresh or getattr(thing, name, _ABSENT) is not value[0]):
         _refuse(thing, name)
 
 
@@ -185,9 +184,9 @@ def _refuse(thing: Any, name: str) -> NoReturn:
     text = f"`{name}` of {kind.__name__} cannot be assigned, as what runs would not be what is recorded"
     given = f"{name}=..." if name in fields else ", ".join(f"{field}=..." for field in fields)
     text += f": make another {kind.__name__}({given})"
-    number = f"{getattr(thing, 'live_as', '')}.{name}".replace("*", "0")
-    number = f"forces.{kind.__name__}.{name}" if name in getattr(kind, "live", ()) else number
-    if number in LIVE or number.startswith("forces."):
+    if name in getattr(kind, "live", ()):
+        place = kind.live_as.replace("forces.*", f"forces.{kind.__name__}").replace("*", "0")
+        number = f"{place}.{name}".lstrip(".")
         text += f", or between two frames `simulation.change({number!r}, ...)`"
     raise AttributeError(f"{text}.")
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_like, check_shape
+from gaussian_swaying._live import live_numbers
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.kernels.derive import Memory, on_tensors
 from gaussian_swaying.kernels.graphs import Component, tensors_in
@@ -48,7 +49,7 @@ class Force(Component, nn.Module):
         ...         return 0.1 * state.position.new_tensor([0.0, 0.0, -9.8]).expand_as(state.position)
     """
 
-    live: Mapping[str, Any] = {}
+    live_as, live = "forces.*", live_numbers()
 
     def forward(self, state: State) -> Given:
         """The force at the start of a substep: that of the nearest device function of the class and its bases.

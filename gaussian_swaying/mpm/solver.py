@@ -19,6 +19,7 @@ from torch.utils.checkpoint import checkpoint as recomputed
 
 from gaussian_swaying._checks import check_like, check_positive, check_shape, check_vector
 from gaussian_swaying._fixed import Fixed, FixedList, assign, count_change
+from gaussian_swaying._live import SIZE, live_numbers
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.boundary import Boundary
 from gaussian_swaying.mpm.contact import Surface
@@ -88,6 +89,7 @@ class MPMSolver(Fixed, Solver):
     """
 
     live_as = "solver"
+    live = live_numbers(gravity={"kind": "vector"}, damping=SIZE, stiffness_damping=SIZE)
 
     def __init__(
         self,

@@ -24,6 +24,7 @@ from gaussian_swaying._checks import (
     requires_grad,
 )
 from gaussian_swaying._fixed import Fixed, FixedList, changed, fixed
+from gaussian_swaying._live import SAME, SIZE, TOGETHER, live_numbers
 from gaussian_swaying.gaussians.area import coverage_area, patch_area
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.connectivity import attached_pairs
@@ -298,6 +299,9 @@ class Material:
     """
 
     live_as = "material"
+    live = live_numbers(
+        E=SIZE | SAME, nu=SAME, density=SIZE | SAME, thickness=SIZE | TOGETHER | {"same_points": False},
+    )  # fmt: skip
 
     E: Number = 1e5
     nu: Number = 0.3

@@ -22,10 +22,9 @@ from gaussian_swaying._checks import (
     check_vector,
     check_whole,
     number_of,
-    requires_grad,
 )
-from gaussian_swaying._fixed import LIVE, FixedList, changed, fixed
-from gaussian_swaying._numbers import sense_of
+from gaussian_swaying._fixed import FixedList, changed, fixed
+from gaussian_swaying._live import SIZE, Live, live_numbers
 from gaussian_swaying.captures.capture_camera import CaptureCamera, photo_azimuth, read_views
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.harmonics import SH_DC
@@ -46,7 +45,7 @@ from gaussian_swaying.rendering.cameras.camera_path import CameraPath, OrbitCame
 from gaussian_swaying.scenes.procedural import GivenScene, ProceduralScene
 from gaussian_swaying.simulation.body import PLATE, Material, Scene, SimulatedScene, suggest_spacing
 from gaussian_swaying.wind.computed_air import ComputedAir
-from gaussian_swaying.wind.field import SpatialWind, WindField, flow_rows
+from gaussian_swaying.wind.field import Modulation, SpatialWind, WindField, flow_rows
 from gaussian_swaying.wind.force import AeroForce
 from gaussian_swaying.wind.turbulence import LOOKS, look
 
@@ -57,112 +56,33 @@ POLAR = ("wind.speed", "wind.azimuth", "wind.elevation")
 """Three numbers that together are ``wind.flow``."""
 
 
-@fixed
-@dataclass(frozen=True)
-class Live:
-    """A number, or three, that may change between two frames.
-
-    It can be changed with :meth:`~gaussian_swaying.simulation.simulation.Simulation.change`, has a control on the live
-    page, and can be an unknown of a fit and an axis of a sweep. A force of your own names its numbers in its class:
-    ``live = {"strength": Live(unit="N", low=0.0)}``.
-
-    Args:
-        unit: Its unit; empty for a pure number.
-        low: Smallest value.
-        high: Largest value.
-        scale: ``log`` for sizes of any order of magnitude, else ``linear``.
-        kind: ``number``, ``whole`` or ``vector`` (three numbers).
-        batched: Whether simulations that differ in it are steps of one rollout.
-        same_points: Whether all objects take it without other points, patches or contact.
-        differentiable: Whether it keeps the gradient of a tensor.
-    """
-
-    unit: str = ""
-    low: float = -math.inf
-    high: float = math.inf
-    scale: Literal["linear", "log"] = "linear"
-    kind: Literal["number", "whole", "vector"] = "number"
-    batched: bool = False
-    same_points: bool = True
-    differentiable: bool = False
-
-    def check(self, name: str, value: Any) -> Any:
-        """A value as plain numbers, or as the tensor that it is if a gradient is required; messages have the name."""
-        if requires_grad(value) and not self.differentiable:
-            raise ValueError(f"`{name}` would lose its gradient: give a plain number (`tensor.detach()`).")
-        if self.kind == "vector":
-            plain = check_vector(name, value.detach() if isinstance(value, Tensor) else value)
-            return value if isinstance(value, Tensor) and value.requires_grad else list(plain)
-        if isinstance(value, bool) or not isinstance(value, int | float | Tensor):
-            raise TypeError(f"Expected `{name}` to be a number, but got {value!r:.60}.")
-        if self.kind == "whole" and value != int(value):
-            raise TypeError(f"Expected `{name}` to be a whole number, but got {value!r:.60}.")
-        plain_number = float(number_of(value))
-        if not self.low <= plain_number <= self.high or not math.isfinite(plain_number):
-            raise ValueError(f"Expected `{name}` to be {self.range_in_words}, but got {plain_number:g}.")
-        if isinstance(value, Tensor) and value.requires_grad:
-            return value
-        return int(plain_number) if self.kind == "whole" else plain_number
-
-    @property
-    def range_in_words(self) -> str:
-        if self.low == -math.inf:
-            return "finite"
-        return f"at least {self.low:g}" if self.high == math.inf else f"from {self.low:g} to {self.high:g}"
-
-
-_SIZE, _TOGETHER = {"scale": "log"}, {"batched": True}
-_SAME = _TOGETHER | {"differentiable": True}
-_SETTINGS: dict[str, dict[str, Any]] = {
-    "wind.flow": {"kind": "vector"} | _SAME,
-    "wind.seed": {"kind": "whole"} | _TOGETHER,
-    "wind.speed": _SIZE | _TOGETHER,
-    "wind.azimuth": _TOGETHER,
-    "wind.elevation": _TOGETHER,
-    **{f"wind.modulations.*.{n}": _SIZE | _TOGETHER for n in ("amplitude", "delta", "std", "period", "interval")},
-    "wind.modulations.*.phase": _TOGETHER,
-    "material.E": _SIZE | _SAME,
-    "material.nu": _SAME,
-    "material.density": _SIZE | _SAME,
-    "material.thickness": _SIZE | _TOGETHER | {"same_points": False},
-    **{f"aero.{name}": _SIZE | {"differentiable": True} for name in ("C_D", "C_F", "C_L")},
-    "aero.added_mass": _SIZE,
-    "solver.gravity": {"kind": "vector"},
-    "solver.damping": _SIZE,
-    "solver.stiffness_damping": _SIZE,
-    "frame_dt": _SIZE,
-}
-NUMBERS = {
-    name: Live(**((sense._asdict() if (sense := sense_of(name)) else {}) | settings))
-    for name, settings in _SETTINGS.items()
-}
-"""The numbers that may change, without those of forces; ``*`` stands for the place of a modulation."""
-LIVE.update(name.replace("*", "0") for name in NUMBERS)
-
-
-def _forces() -> list[type[Force]]:
-    """All kinds of forces."""
-    found: list[type[Force]] = [Force]
+def _with_numbers() -> list[type]:
+    """All kinds of components whose numbers may change, those of a user's own too."""
+    found: list[type] = [WindField, Modulation, Material, AeroForce, MPMSolver, Model, Force]
     for kind in found:
-        found += kind.__subclasses__()
+        found += kind.__subclasses__() if issubclass(kind, Modulation | Force) else []
     return found
 
 
+def _all() -> dict[str, Live]:
+    return {
+        f"{kind.live_as.replace('forces.*', f'forces.{kind.__name__}')}.{name}".lstrip("."): value  # type: ignore[attr-defined]
+        for kind in _with_numbers()
+        for name, value in kind.live.items()  # type: ignore[attr-defined]
+    }
+
+
 def names() -> list[str]:
-    """The names of all numbers that may change."""
-    return [*NUMBERS, *dict.fromkeys(f"forces.{kind.__name__}.{name}" for kind in _forces() for name in kind.live)]
+    """The names of all numbers that may change; ``*`` stands for the place of a modulation."""
+    return list(_all())
 
 
 def find(name: str) -> Live | None:
     """The number of a name, or None. ``wind.modulations.0.FIELD`` is any number of a modulation of the wind."""
     parts = name.split(".")
-    if parts[0] == "forces" and len(parts) == 3:
-        return next(
-            (kind.live[parts[2]] for kind in _forces() if kind.__name__ == parts[1] and parts[2] in kind.live), None
-        )
     if parts[:2] == ["wind", "modulations"] and len(parts) == 4 and parts[2].isdecimal():
-        return NUMBERS.get(f"wind.modulations.*.{parts[3]}", Live(batched=True))
-    return NUMBERS.get(name)
+        return _all().get(f"wind.modulations.*.{parts[3]}", Live(batched=True))
+    return _all().get(name)
 
 
 def number(name: str) -> Live:
@@ -188,6 +108,8 @@ class Model:
         air: The box of computed air; None if the wind is given everywhere.
         frame_dt: Time between frames [s].
     """
+
+    live_as, live = "", live_numbers(frame_dt=SIZE)
 
     scene: SimulatedScene
     material: Material

@@ -24,6 +24,7 @@ from gaussian_swaying._checks import (
     requires_grad,
 )
 from gaussian_swaying._fixed import Fixed, FixedList, changed, fixed
+from gaussian_swaying._live import SAME, SIZE, TOGETHER, live_numbers
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.keyed_path import picked
 from gaussian_swaying.geometry.linalg import vectors
@@ -136,7 +137,7 @@ def _modulate(
 class Modulation(Component, nn.Module, ABC):
     """Base of all modulations, which change the wind velocity at a given time."""
 
-    live_as = "wind.modulations.*"
+    live_as, live = "wind.modulations.*", live_numbers()
     numbers: tuple[str, ...] = ()
     """Names of its numbers, if it has a device function; those of several scenes can be tensors of shape (B,)."""
     function: Any = None
@@ -167,6 +168,7 @@ class SineSway(Modulation):
     recordable = True
     numbers = ("amplitude", "period", "phase")
     function = swayed
+    live = live_numbers(amplitude=SIZE | TOGETHER, period=SIZE | TOGETHER, phase=TOGETHER)
 
     def __init__(self, amplitude: float = 0.5, period: float = 2.0, phase: float = 0.0) -> None:
         super().__init__()
@@ -187,6 +189,7 @@ class UniformGust(Modulation):
     recordable = True
     numbers = ("delta", "interval")
     function = scaled
+    live = live_numbers(delta=SIZE | TOGETHER, interval=SIZE | TOGETHER)
 
     def __init__(self, delta: float = 0.3, interval: float = 0.04) -> None:
         super().__init__()
@@ -207,6 +210,7 @@ class GaussianGust(Modulation):
     recordable = True
     numbers = ("std", "interval")
     function = shaken
+    live = live_numbers(std=SIZE | TOGETHER, interval=SIZE | TOGETHER)
 
     def __init__(self, std: float = 0.3, interval: float = 0.04) -> None:
         super().__init__()
@@ -303,6 +307,10 @@ class WindField(Fixed, nn.Module):
     """
 
     live_as = "wind"
+    live = live_numbers(
+        flow=SAME | {"kind": "vector"}, seed=TOGETHER | {"kind": "whole"}, speed=SIZE | TOGETHER, azimuth=TOGETHER,
+        elevation=TOGETHER,
+    )  # fmt: skip
 
     def __init__(
         self,

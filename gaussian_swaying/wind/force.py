@@ -23,6 +23,7 @@ from gaussian_swaying._checks import (
 )
 from gaussian_swaying._devices import in_double
 from gaussian_swaying._fixed import Fixed, FixedList, changed
+from gaussian_swaying._live import SIZE, live_numbers
 from gaussian_swaying.geometry.groups import sums
 from gaussian_swaying.geometry.linalg import entries, vectors
 from gaussian_swaying.geometry.linalg_triton import (
@@ -384,6 +385,7 @@ class AeroForce(Fixed, nn.Module):
     """
 
     live_as = "aero"
+    live = live_numbers(**{name: SIZE | {"differentiable": True} for name in ("C_D", "C_F", "C_L")}, added_mass=SIZE)
 
     def __init__(
         self,
