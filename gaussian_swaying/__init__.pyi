@@ -1,5 +1,6 @@
 """The public names of the package; everything else is imported from its room."""
 
+from ._live import Live as Live
 from .captures.capture import read_capture as read_capture
 from .evaluation.compare import compare_run as compare_run
 from .fitting.fit import fit as fit
@@ -36,7 +37,6 @@ from .simulation.draw import Frame as Frame
 from .simulation.measure import SimulationDiverged as SimulationDiverged
 from .simulation.model import Copy as Copy
 from .simulation.model import Edit as Edit
-from ._live import Live as Live
 from .simulation.simulation import Simulation as Simulation
 from .suggestion.suggest import suggest as suggest
 from .training.data.datamodule import CaptureDataModule as CaptureDataModule

@@ -34,7 +34,8 @@ from gaussian_swaying.rendering.protocol import Renderer, RenderOutput
 from gaussian_swaying.rendering.shading import Shader
 from gaussian_swaying.simulation.body import SimulatedScene
 from gaussian_swaying.simulation.measure import FrameDiagnostics
-from gaussian_swaying.simulation.step import Launched, SceneEditor, Stepper
+from gaussian_swaying.simulation.model import Model
+from gaussian_swaying.simulation.step import Launched, SceneEditor, Stepper, stepper_of
 from gaussian_swaying.wind.field import WindField
 
 MAX_PIXELS = 1 << 26  # per picture: twice as many as 8K
@@ -320,6 +321,29 @@ class Painter(Fixed, nn.Module):
         """Ends of the depth's colour scale [scene units]: one longest side before and behind the object's centre."""
         distance = float((self._camera(frame, name).position.to(self.center) - self.center).norm())
         return distance - self.size, distance + self.size
+
+
+def draw(
+    model: Model, state: State, camera: Camera, shader: Shader | None = None, background: Sequence[float] = (0, 0, 0)
+) -> RenderOutput:
+    """The picture of a state of :func:`~gaussian_swaying.simulation.step.step`.
+
+    Args:
+        model: The model.
+        state: Its state.
+        camera: In scene units.
+        shader: Colours from normals and light; None keeps the colours of the splat.
+        background: Background colour, in [0, 1].
+
+    Returns:
+        Colour, opacity and depth, shape (H, W, ·).
+    """
+    stepper, known = stepper_of(model), model.shared.get("painter")
+    if known is None or known[0] is not shader or known[1] != tuple(background):
+        painter = Painter(stepper, shader, background=background).to(stepper.device)
+        known = model.shared["painter"] = (shader, tuple(background), painter)
+    means = model.scene.model.means
+    return known[2].picture(known[2].deformed(state), camera.to(means.device, means.dtype))
 
 
 def seen_from(sh: Tensor, eye: Tensor, means: Tensor, rotations: Tensor | None) -> tuple[Tensor, Tensor]:

@@ -105,8 +105,10 @@ class Model:
         aero: The force of the wind on patches.
         forces: The custom forces.
         solver: Numbers of the solver.
+        method: The solver that was given, without a material: formulation, pins and obstacles.
         air: The box of computed air; None if the wind is given everywhere.
         frame_dt: Time between frames [s].
+        shared: What ``step`` and ``draw`` keep of this model and of those that are made from it.
     """
 
     live_as, live = "", live_numbers(frame_dt=SIZE)
@@ -117,8 +119,10 @@ class Model:
     aero: AeroForce
     forces: tuple[Force, ...]
     solver: Any
+    method: Solver
     air: ComputedAir | None = None
     frame_dt: float = 0.04
+    shared: dict[str, Any] = field(default_factory=dict, repr=False)
 
     @property
     def points(self) -> MaterialPoints:

@@ -238,7 +238,7 @@ class Simulation(Fixed):
         camera = as_camera(camera, cameras, blowing, seen)
         own = tuple(force.in_frame(seen.frame) for force in as_forces(forces))
         aero = aero or AeroForce()
-        model = Model(seen, material, blowing, aero, own, solver.settings, air, float(frame_dt))
+        model = Model(seen, material, blowing, aero, own, solver.settings, solver, air, float(frame_dt))
         wait_for_device()
         placed = Copies(copies, model, solver) if copies else None
         self._stepper = Stepper(solver, model, copies=placed)
@@ -409,8 +409,6 @@ class Simulation(Fixed):
     def _adopt(self, model: Model) -> None:
         editor, points = self._editor, model.points
         with torch.inference_mode(False):
-            for part in (model.wind, model.aero, *model.forces):
-                part.to(self.device)
             if points is not self.model.points and editor.unedited is not None:
                 editor.unedited = changed(editor.unedited, points=points)
             self._stepper.take(model, running=self._stepper.starts > 0)

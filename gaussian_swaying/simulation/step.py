@@ -488,6 +488,8 @@ class Stepper:
         Returns:
             The state at rest if the solver was bound again.
         """
+        for part in (model.wind, model.aero, *model.forces):
+            part.to(self.device)
         before, self.model, self.models = self.model, model, self._spread(model)
         if model.solver is not before.solver:
             assign(self.solver, settings=model.solver)
@@ -643,6 +645,37 @@ class Stepper:
         air.take(self.wind_force)
         end, moments, courant = air.roll(self.solver, state, state.air, substeps, self.forces, CFL_SAMPLES, watch)
         return end.replace(air=moments), courant
+
+
+def stepper_of(model: Model) -> Stepper:
+    """What advances a model and those that were made from it: what they have in common is computed once."""
+    if "stepper" not in model.shared:
+        model.shared["stepper"] = Stepper(model.method.like(model.solver), model)
+    stepper: Stepper = model.shared["stepper"]
+    if stepper.model is not model:
+        stepper.take(model, running=stepper.starts > 0)
+    return stepper
+
+
+def start(model: Model) -> State:
+    """The state of a model at rest, at time zero; raises as :meth:`Stepper.start`."""
+    return stepper_of(model).start()
+
+
+def step(model: Model, state: State) -> State:
+    """A frame later: in as many substeps as are stable, done again with shorter ones where these were too long.
+
+    A function of its arguments, through which gradients reach numbers of the model and the state. Models that differ in
+    numbers share what does not depend on them, so ``model.at("wind.speed", 9)`` may be another one in every frame.
+
+    Args:
+        model: The model, such as ``simulation.model``.
+        state: The state now, of :func:`start` or of this function.
+
+    Raises:
+        SimulationDiverged: If no substep is stable.
+    """
+    return stepper_of(model).advance(state)[0]
 
 
 class Launched:

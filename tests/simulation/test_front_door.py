@@ -16,6 +16,7 @@ from small_films import base
 
 from gaussian_swaying import (
     AeroForce,
+    DiffuseShader,
     Edit,
     Frame,
     Material,
@@ -34,7 +35,9 @@ from gaussian_swaying.mpm.colliders import HalfSpaceObstacle
 from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.mpm.pins import Impulse
 from gaussian_swaying.scenes import FlagScene
+from gaussian_swaying.simulation.draw import draw
 from gaussian_swaying.simulation.model import Normalisation
+from gaussian_swaying.simulation.step import start, step
 
 POLE = up_to(x=0.11)
 SMALL = {"hold": POLE, "material": Material(E=3e3, density=30.0), "wind": [6.0, 1.5, 0.0], "device": "cpu"}
@@ -61,6 +64,52 @@ def test_a_frame_has_what_its_state_says():
     assert torch.equal(last.gaussians.colors, simulation.painter.colors(expected, camera))
     assert torch.equal(last.render().color, simulation.painter.render(last.state, 2).color)
     assert last.health.kinetic > 0
+
+
+def test_a_model_is_advanced_and_drawn_by_functions():
+    """As the simulation does it, whatever other model was advanced between two frames."""
+    simulation = _flag()
+    model = simulation.model
+    other = model.at({"wind.speed": 9.0, "material.E": 9e3})
+    state, mixed = start(model), start(other)
+    expected, alone = simulation.start(), mixed
+    for _ in range(3):
+        state, mixed = step(model, state), step(other, mixed)
+        expected, _ = simulation.advance(expected)
+    for _ in range(3):
+        alone = step(other, alone)
+    assert torch.equal(state.position, expected.position)
+    assert torch.equal(mixed.position, alone.position)
+    assert peak(mixed.position - state.position) > 1e-3
+    assert simulation.model.value("wind.speed") == model.value("wind.speed")
+    camera = simulation.painter.camera_at(3)
+    for shader in (None, DiffuseShader()):
+        simulation.painter.shader = shader
+        assert torch.equal(draw(model, state, camera, shader).color, simulation.painter.render(expected, 3).color)
+    white = draw(model, state, camera, background=(1, 1, 1)).color
+    assert white.amin(-1)[0, 0] == 1.0
+
+
+@pytest.mark.parametrize(("name", "value", "shift"), [("wind.flow", [0.0, 4.0, 0.0], 1e-3), ("material.E", 3e3, 1.0)])
+def test_a_frame_has_a_gradient(name, value, shift):
+    solver = MPMSolver(0.2, gravity=(0, 0, 0), substep=2e-3, boundaries=[PinnedRegion(POLE)])
+    model = _flag(dtype="float64", solver=solver, hold=None, wind=[0.0, 4.0, 0.0]).model
+
+    def moved(given):
+        changed = model.at(name, given)
+        state = start(changed)
+        for _ in range(3):
+            state = step(changed, state)
+        return state.position[:, 1].mean()
+
+    given = torch.tensor(value, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(moved(given), given)
+    if slope.dim():
+        ends = [moved([0.0, 4.0 + part, 0.0]) for part in (shift, -shift)]
+        slope = slope[1]
+    else:
+        ends = [moved(value + part) for part in (shift, -shift)]
+    assert slope.item() == pytest.approx(float(ends[0] - ends[1]) / (2 * shift), rel=1e-3)
 
 
 # ---- nothing is said twice
