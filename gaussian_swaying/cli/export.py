@@ -33,8 +33,8 @@ def build_options() -> argparse.ArgumentParser:
         "target",
         nargs="?",
         help=f"File to write; its name ends in one of {', '.join(SUFFIXES.values())}, for a run, unless it is USD, "
-        "with # for the digits of the frame, as in frame_####.spz; or with --web in .html (default: film.html in the "
-        "folder of the run).",
+        "with # for the digits of the frame, as in frame_####.spz; or .sway for a film; or with "
+        "--web .html (default: film.html in the folder of the run).",
     )
     parser.add_argument(
         "--web",
@@ -92,8 +92,8 @@ def main(arguments: list[str] | None = None) -> int:
 def export(options: argparse.Namespace) -> None:
     """Convert, and report the file."""
     given = {"--up": options.up, "--metres-per-unit": options.metres_per_unit}
-    if options.web:
-        refuse("--web", given | {"--spz-version": options.spz_version, "--apart": options.apart or None})
+    if options.web or Path(options.target or "").suffix == ".sway":
+        refuse("a film", given | {"--spz-version": options.spz_version, "--apart": options.apart or None})
         return export_web(options)
     if options.target is None:
         raise ValueError(f"Expected a file to write, whose name ends in one of {', '.join(SUFFIXES.values())}.")

@@ -29,11 +29,7 @@ def split_far(displacement: np.ndarray, limit: float) -> tuple[np.ndarray, np.nd
         The displacements, float16, shape (N, 3), zero for the far nodes; and index and displacement of the far ones,
         the latter as the bits of float32, int32, shape (L, 4).
     """
-    return split_at(displacement, ~(np.abs(displacement).max(axis=1, initial=0) <= min(limit, 65504.0)))
-
-
-def split_at(displacement: np.ndarray, far: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """:func:`split_far` for given far nodes, bool, shape (N,)."""
+    far = ~(np.abs(displacement).max(axis=1, initial=0) <= min(limit, 65504.0))
     index = far.nonzero()[0].astype(np.int32)
     rows = np.concatenate([index[:, None], displacement[far].astype(np.float32).view(np.int32)], axis=1)
     return np.where(far[:, None], 0, displacement).astype(np.float16), rows

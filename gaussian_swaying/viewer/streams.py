@@ -22,13 +22,12 @@ from torch import Tensor
 
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.gaussians.parts import ROLES
-from gaussian_swaying.recording.nodes import split_far
 from gaussian_swaying.rendering.shading import DiffuseShader
 from gaussian_swaying.rendering.tints import by_role
 from gaussian_swaying.simulation.body import SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.viewer.film.page import PAGE, message, pack_splats
-from gaussian_swaying.viewer.film.recorded import film_without_frames, look_of
+from gaussian_swaying.viewer.film.page import PAGE, in_steps, message, pack_splats
+from gaussian_swaying.viewer.film.recorded import STEPS, film_without_frames, look_of
 from gaussian_swaying.viewer.session import Snapshot
 
 BRUSH = "/brush"  # path
@@ -191,15 +190,17 @@ def state_message(snapshot: Snapshot, ended: bool) -> bytes:
         moved = scene.follow.nodal(state)
         assert moved is not None
         values = moved.float().numpy(force=True)
-    near, far = split_far(values, 0.5 * scene.size * scene.frame.metres_per_unit)
+    step = scene.size * scene.frame.metres_per_unit / STEPS
+    near, far = in_steps(values, step)
     head = {
         "kind": "state",
         "motion": snapshot.motion,
         "time": snapshot.health.time,
         "nodes": len(near),
+        "step": step,
         "ended": ended,
     }
-    return message(head, near.astype("<f2").tobytes(), far.astype("<i4").tobytes())
+    return message(head, near.astype("<i2").tobytes(), far.astype("<i4").tobytes())
 
 
 def _turn(simulation: Simulation) -> AbstractContextManager[None]:

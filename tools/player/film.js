@@ -21,7 +21,7 @@ function readFar(bytes, frames) {
 class Frames {
   constructor({ frames, nodes }) {
     this.row = 3 * nodes;
-    this.near = new Uint16Array(frames * this.row);
+    this.near = new Int16Array(frames * this.row);
     this.far = [];
   }
 
@@ -33,8 +33,8 @@ class Frames {
     const begin = this.loaded * this.row;
     const end = begin + count * this.row;
     const size = 2 * (end - begin);
-    this.near.set(reader(bytes.subarray(0, size))(Uint16Array, end - begin), begin);
-    for (let i = Math.max(begin, this.row); i < end; i++) this.near[i] += this.near[i - this.row]; // differences to the frame before
+    const folded = reader(bytes.subarray(0, size))(Uint16Array, end - begin); // differences to the frame before, the sign in the last bit
+    folded.forEach((value, k) => (this.near[begin + k] = ((value >> 1) ^ -(value & 1)) + (this.near[begin + k - this.row] ?? 0)));
     this.far.push(...readFar(bytes.subarray(size), count));
   }
 }
@@ -62,7 +62,7 @@ export async function play(read, tell) {
     if (frame === state.frame) return;
     const { row } = frames;
     const from = frames.near.subarray(frame * row, (frame + 1) * row);
-    drawing.move((data) => writeNodes(data, from, frames.far[frame]));
+    drawing.move((data) => writeNodes(data, from, frames.far[frame], head.step));
     state.frame = frame;
     slider.value = String(frame);
     const seconds = (count) => (count * head.frame_dt).toFixed(2);

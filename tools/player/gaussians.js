@@ -19,15 +19,12 @@ export function reader(bytes) {
   };
 }
 
-// The numbers of float16, by their bits.
-const halves = Float32Array.from({ length: 65536 }, (_, bits) => THREE.DataUtils.fromHalfFloat(bits));
-
-// Writes the displacements of all nodes, four numbers each: `near` has float16, `far` index and displacement of the few that swing far.
-export function writeNodes(data, near, far) {
+// Writes the displacements of all nodes [m], four numbers each: `near` has steps, `far` index and displacement of the few that swing far.
+export function writeNodes(data, near, far, step) {
   for (let i = 0, at = 0; i < near.length; i += 3, at += 4) {
-    data[at] = halves[near[i]];
-    data[at + 1] = halves[near[i + 1]];
-    data[at + 2] = halves[near[i + 2]];
+    data[at] = step * near[i];
+    data[at + 1] = step * near[i + 1];
+    data[at + 2] = step * near[i + 2];
   }
   for (let i = 0; i < far.rows.length; i += 4) data.set(far.values.subarray(i + 1, i + 4), 4 * far.rows[i]);
 }

@@ -19,10 +19,10 @@ function unpack(data) {
 
 // The displacement of all nodes, four numbers each.
 function readState(head, rest) {
-  const near = new Uint16Array(rest.buffer, 0, 3 * head.nodes);
+  const near = new Int16Array(rest.buffer, 0, 3 * head.nodes);
   const moved = new Float32Array(4 * head.nodes);
   const far = rest.slice(near.byteLength).buffer;
-  writeNodes(moved, near, { rows: new Int32Array(far), values: new Float32Array(far) });
+  writeNodes(moved, near, { rows: new Int32Array(far), values: new Float32Array(far) }, head.step);
   return { time: head.time, moved };
 }
 

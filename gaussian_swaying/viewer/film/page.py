@@ -1,10 +1,11 @@
-"""One .html file that plays a film: page, program and data, all inside it."""
+"""A film as a .sway file, or as one .html file that plays it: page, program and data, all inside it."""
 
 from __future__ import annotations
 
 import base64
 import html
 import json
+import os
 import re
 import zlib
 from itertools import pairwise, zip_longest
@@ -13,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from gaussian_swaying._files import check_page, write_text
-from gaussian_swaying.recording.nodes import join_far, split_at
-from gaussian_swaying.viewer.film.recorded import Film, read_film
+from gaussian_swaying._checks import first_line
+from gaussian_swaying._files import atomic, check_page, write_text
+from gaussian_swaying.gaussians.ply import check_folder
+from gaussian_swaying.viewer.film.recorded import STEPS, Film, read_film
 
 PAGE = Path(__file__).parent / "page"
 RECORD = {
@@ -36,23 +38,61 @@ PART = 1 << 16
 """Gaussians of a later part: whole rows of the player's textures, as in the first one."""
 GROUP = 32
 """Frames of a part."""
+MAGIC, VERSION = b"SWAY", 1
 
 
 def write_film(run: Path, target: Path) -> Film:
-    """Write the film of a recorded run as one .html file.
+    """Write the film of a recorded run as one file.
 
     Args:
         run: The output folder of ``gaussian-swaying sim``.
-        target: The file; its name ends in .html.
+        target: The file; its name ends in .html for a page, or in .sway for the film alone (docs/bundle.md).
 
     Returns:
         The film.
     """
-    check_page(target, "film")
+    bundle = target.suffix == ".sway"
+    if not bundle:
+        check_page(target, "film")
+    check_folder(target)
     film = read_film(run)
-    text = page(film)
-    write_text(target, text)
+    if bundle:
+        with atomic(target) as temporary:
+            temporary.write_bytes(bundled(film))
+    else:
+        write_text(target, page(film))
     return film
+
+
+def bundled(film: Film) -> bytes:
+    """The content of a .sway file: a heading, then the compressed blocks, each after its size."""
+    found = [MAGIC, VERSION.to_bytes(4, "little")]
+    for block in pack(film).values():
+        packed = zlib.compress(block, 9)
+        found += [len(packed).to_bytes(4, "little"), packed]
+    return b"".join(found)
+
+
+def read_bundle(path: str | os.PathLike[str]) -> Film:
+    """The film in a .sway file.
+
+    Raises:
+        ValueError: If it is no such file, of a later version, or damaged.
+    """
+    content, at, blocks = Path(path).read_bytes(), 8, []
+    if content[:4] != MAGIC or len(content) < 8:
+        raise ValueError(f"{path} is no .sway file: write one with `gaussian-swaying export RUN film.sway`.")
+    version = int.from_bytes(content[4:8], "little")
+    if version != VERSION:
+        raise ValueError(f"{path} is a .sway file of version {version}, but this program reads {VERSION}: update it.")
+    try:
+        while at < len(content):
+            size = int.from_bytes(content[at : at + 4], "little")
+            blocks.append(zlib.decompress(content[at + 4 : at + 4 + size]))
+            at += 4 + size
+        return unpack(dict(zip(["head", "stencils", *(f"part-{k}" for k in range(len(blocks)))], blocks, strict=False)))
+    except (zlib.error, ValueError, KeyError, TypeError, IndexError) as error:
+        raise ValueError(f"{path} is damaged ({first_line(error)}): export the run again.") from error
 
 
 def page(film: Film) -> str:
@@ -91,6 +131,33 @@ def message(head: dict[str, Any], *blocks: bytes) -> bytes:
     return b"".join([len(text).to_bytes(4, "little"), text, *blocks])
 
 
+def in_steps(displacement: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Displacements as whole numbers of steps, and those of nodes that swing too far for 16 bits.
+
+    A node at the border of a body has almost no mass, and may swing by thousands of times its size.
+
+    Args:
+        displacement: Displacement of the nodes [m], shape (N, 3).
+        step: Length of a step [m].
+
+    Returns:
+        The numbers, int16, shape (N, 3), zero for the far nodes; index and displacement of these, the latter as the
+        bits of float32, int32, shape (L, 4).
+    """
+    steps = np.round(displacement / step)
+    far = ~(np.abs(steps).max(axis=1, initial=0) < STEPS)
+    index = far.nonzero()[0].astype(np.int32)
+    rows = np.concatenate([index[:, None], displacement[far].astype(np.float32).view(np.int32)], axis=1)
+    return np.where(far[:, None], 0, steps).astype(np.int16), rows
+
+
+def of_steps(near: np.ndarray, far: np.ndarray, step: float) -> np.ndarray:
+    """The inverse of :func:`in_steps`, float32, shape (N, 3)."""
+    displacement: np.ndarray = near * np.float32(step)
+    displacement[far[:, 0]] = np.ascontiguousarray(far[:, 1:]).view(np.float32)
+    return displacement
+
+
 def parts_of(head: dict[str, Any]) -> list[list[Any]]:
     """The parts of the file, each as its kind and the first and last (excluded) of its Gaussians or frames.
 
@@ -113,13 +180,12 @@ def parts_of(head: dict[str, Any]) -> list[list[Any]]:
 def pack(film: Film) -> dict[str, bytes]:
     """The blocks of data that the page unpacks, in the order in which it needs them.
 
-    Bytes of the same weight stand together, and frames are differences to the frame before as whole numbers; both
-    lose nothing, and the blocks compress to less.
+    Bytes of the same weight stand together, and frames are differences to the frame before, modulo 65536; both lose
+    nothing, and the blocks compress to less.
     """
-    near, far = zip(*(_split(frame) for frame in film.displacement), strict=True)
-    bits = np.stack(near).view(np.uint16)
-    frames = bits.copy()
-    frames[1:] -= bits[:-1]  # modulo 65536
+    near, far = zip(*(in_steps(frame, film.head["step"]) for frame in film.displacement), strict=True)
+    frames: np.ndarray = np.diff(np.stack(near).view(np.uint16), axis=0, prepend=np.uint16(0))
+    frames = frames << 1 ^ -(frames >> 15)  # the sign in the last bit, so that small numbers have a first byte of zero
     counts = np.array([len(rows) for rows in far], np.uint32)
     parts = parts_of(film.head)
     blocks = pack_head(film, parts)
@@ -161,15 +227,8 @@ def pack_splats(film: Film, moving: bool, first: int = 0, last: int | None = Non
     return rows.T.tobytes()
 
 
-def _split(displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """One frame in float16, and in float32 the nodes that float16 would round."""
-    with np.errstate(over="ignore"):
-        rounded = displacement.astype(np.float16).astype(np.float32)
-    return split_at(displacement, (rounded != displacement).any(axis=1))
-
-
 def unpack(blocks: dict[str, bytes]) -> Film:
-    """The inverse of :func:`pack`; ``order`` is lost."""
+    """The inverse of :func:`pack`, with displacements to half a step; ``order`` is lost."""
     head = json.loads(blocks["head"])
     parts, _ = head.pop("parts"), head.pop("start")
     found: dict[str, list[np.ndarray]] = {name: [] for name in RECORD}
@@ -179,11 +238,12 @@ def unpack(blocks: dict[str, bytes]) -> Film:
         if kind == "frames":
             size = 2 * count * 3 * head["nodes"]
             frames = _unplaned(block[:size], np.dtype("<u2")).reshape(count, head["nodes"], 3)
+            frames = frames >> 1 ^ -(frames & 1)
             bits = np.cumsum(np.concatenate([last[None], frames]), axis=0, dtype=np.uint16)[1:]
             counts = _unplaned(block[size : size + 4 * count], np.dtype("<u4"))
             rows = _unplaned(block[size + 4 * count :], np.dtype("<i4")).reshape(-1, 4)
             far = np.split(rows, np.cumsum(counts)[:-1])
-            moved += [join_far(near, own) for near, own in zip(bits.view(np.float16), far, strict=True)]
+            moved += [of_steps(*frame, head["step"]) for frame in zip(bits.view(np.int16), far, strict=True)]
             last = bits[-1]
             continue
         rows, at = np.frombuffer(block, np.uint8).reshape(-1, count).T, 0

@@ -13,15 +13,19 @@ from torch import Tensor
 
 from gaussian_swaying._devices import in_double
 from gaussian_swaying.gaussians.harmonics import sh_to_color
+from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.geometry.rotations import quat_multiply, rotation_to_quat
 from gaussian_swaying.mpm.state import GridSpec
-from gaussian_swaying.mpm.transfer import Stencil
+from gaussian_swaying.mpm.transfer import Stencil, bspline_weights
 from gaussian_swaying.mpm.virtual_nodes import coordinates
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.shading import DiffuseShader
 from gaussian_swaying.simulation.body import SimulatedScene
 from gaussian_swaying.simulation.draw import Painter
 from gaussian_swaying.simulation.simulation import RecordedRun, Simulation
+
+STEPS = 1 << 15
+"""Steps of a displacement in the longest side of the object at rest."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +52,7 @@ class Film:
         growth: How much each grows while others are missing (:func:`growth`), in steps of 1/255, uint8, shape (N, 1).
         order: The index of each in the splat, int64, shape (N,); the file does not have it.
         stencils: The nodes of each stencil, as rows of ``displacement``, uint32, shape (S, 27).
-        displacement: Displacement of the nodes [m], float32, shape (K, M, 3); float16 is enough for most.
+        displacement: Displacement of the nodes [m], float32, shape (K, M, 3).
         notes: Sentences on what the film does not show as the run does.
     """
 
@@ -65,6 +69,32 @@ class Film:
     stencils: np.ndarray
     displacement: np.ndarray
     notes: tuple[str, ...] = ()
+
+    def moved(self, frame: int) -> tuple[Tensor, Tensor]:
+        """Centres and covariances in a frame, as the page draws them, without a limit of stretch.
+
+        Args:
+            frame: Its number.
+
+        Returns:
+            Centres, float64, shape (N, 3), and covariances, shape (N, 3, 3).
+        """
+        head, place = self.head, torch.from_numpy(self.place)
+        f = (place - (place - 0.5).floor()).double()  # in float32, as the page does
+        w, slope = bspline_weights(f.T)
+        rows = torch.from_numpy(self.stencils.astype(np.int64))[torch.from_numpy(self.stencil[:, 0].astype(np.int64))]
+        nodes = torch.from_numpy(self.displacement[frame]).double()[rows].unflatten(1, (3, 3, 3)) * head["metre"]
+        x, y, z = w.unbind(0)
+        along = [(slope[0], y, z), (x, slope[1], z), (x, y, slope[2])]
+        u, *columns = (torch.einsum("ap,bp,cp,pabcd->pd", *each, nodes) for each in [(x, y, z), *along])
+        grown = torch.stack(columns, -1) / head["cell"]
+        centre = torch.from_numpy(self.position).double()
+        shape = covariance(torch.from_numpy(self.turn).double() / 32767, torch.from_numpy(self.scale).double())
+        arm = centre[: len(place)] - (place.double() * head["cell"] + torch.tensor(head["corner"]))
+        centre[: len(place)] += u + (grown @ arm[..., None])[..., 0]
+        F = torch.eye(3, dtype=torch.float64) + grown
+        shape[: len(place)] = F @ shape[: len(place)] @ F.mT
+        return centre, shape
 
 
 def read_film(run: Path) -> Film:
@@ -124,6 +154,8 @@ def film_of(simulation: Simulation, grid: GridSpec, nodes: Tensor, displacement:
         "frames": len(displacement),
         "frame_dt": simulation.frame_dt,
         "metre": 1 / size,
+        "step": size / STEPS,
+        "error": 0.5 * size / STEPS,
         "cell": grid.dx / size,
         "corner": [first * grid.dx / size for first in grid.offset],
         "max_stretch": scene.max_stretch,

@@ -11,65 +11,35 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from shared import EYE, longest, peak, refused, seeded, value_error
+from shared import longest, peak, refused, seeded, value_error
 from small_scenes import together
 
 from gaussian_swaying.cli.export import main
 from gaussian_swaying.gaussians.ply import write_ply
-from gaussian_swaying.geometry.covariances import covariance
-from gaussian_swaying.mpm.transfer import bspline_weights
-from gaussian_swaying.recording.nodes import join_far, load_nodes, split_at, split_far
+from gaussian_swaying.recording.nodes import join_far, load_nodes, split_far
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
 from gaussian_swaying.simulation.body import Material, Scene
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.film import page as film_page
-from gaussian_swaying.viewer.film.page import PAGE, pack, page, unpack
+from gaussian_swaying.viewer.film.page import PAGE, in_steps, pack, page, read_bundle, unpack, write_film
 from gaussian_swaying.viewer.film.recorded import growth, read_film, spread
 
 FRAMES = 6
-FIELDS = ("position", "place", "stencil", "scale", "growth", "turn", "facing", "color", "stencils", "displacement")
-
-
-def moved(film, frame):
-    """Centres and covariances of a film's frame [its units], by the formula of the page, in float64."""
-    head = film.head
-    count = len(film.position)
-    movers = len(film.place)
-    place = torch.cat([torch.from_numpy(film.place), torch.full((count - movers, 3), -1.0)])
-    f = (place - (place - 0.5).floor()).double()  # in float32, as the page does
-    place, (w, slope) = place.double(), bspline_weights(f.T)
-    rows = np.zeros((count, 27), int)
-    rows[:movers] = film.stencils[film.stencil[:, 0]]
-    u, gradient = torch.zeros(len(place), 3).double(), torch.zeros(len(place), 3, 3).double()
-    displacement = torch.from_numpy(film.displacement[frame]).double() * head["metre"]
-    for i, j, k in np.ndindex(3, 3, 3):
-        q = displacement[rows[:, 9 * i + 3 * j + k]]
-        weights = w[0, i] * w[1, j] * w[2, k]
-        u += weights[:, None] * q
-        along = (slope[0, i] * w[1, j] * w[2, k], w[0, i] * slope[1, j] * w[2, k], w[0, i] * w[1, j] * slope[2, k])
-        gradient += q[:, :, None] * torch.stack(along, dim=-1)[:, None, :]
-    still = (place[:, 0] < 0)[:, None]
-    u = torch.where(still, 0, u)
-    F = EYE + torch.where(still[..., None], 0, gradient / head["cell"])
-    centre = torch.from_numpy(film.position).double()
-    arm = centre - (place * head["cell"] + torch.tensor(head["corner"]))
-    own = covariance(torch.from_numpy(film.turn).double() / 32767, torch.from_numpy(film.scale).double())
-    position = centre + u + torch.where(still, 0, ((F - torch.eye(3)) @ arm[..., None])[..., 0])
-    return position, F @ own @ F.mT
+FIELDS = ("position", "place", "stencil", "scale", "growth", "turn", "facing", "color", "stencils")
 
 
 def check(simulation, film, frame, state):
-    """The film against the Gaussians of the state, within what float16 allows."""
+    """The film against the Gaussians of the state, within what float16 of the run, or steps of a file, allow."""
     scene = simulation.scene
     size = scene.size * scene.frame.metres_per_unit
     drawn = scene.deformed(state)
     drawn = replace(drawn, means=drawn.means[film.order], covariances=drawn.covariances[film.order])
-    position, shape = moved(film, frame)
+    position, shape = film.moved(frame)
     expected = scene.frame.point_to_sim(drawn.means.double()) / size
     most = float(peak(state.node_displacement)) / size
-    rounding = most * 2**-11  # of each node; the weights are positive and add up to 1
+    rounding = most * 2**-11 + film.head["error"] / size  # of each node; the weights are positive and add up to 1
     in_gradient = 2 * rounding / film.head["cell"]  # slopes of a quadratic spline add up to at most 2
     arms = 0.0 if scene.follow.arm is None else float(longest(scene.follow.arm)) / size
     assert peak(position - expected) <= rounding + 3 * in_gradient * arms + 1e-6
@@ -121,6 +91,43 @@ def test_carried_static_and_plated_gaussians(make_flag, tmp_path):
         check(simulation, film, frame.index, frame.state)
 
 
+def _same(film, other):
+    for name in FIELDS:
+        assert getattr(film, name).dtype == getattr(other, name).dtype
+        assert np.array_equal(getattr(film, name), getattr(other, name)), name
+    assert film.displacement.dtype == other.displacement.dtype
+    assert np.abs(film.displacement - other.displacement).max() <= 1.001 * film.head["error"]
+
+
+def test_a_bundle_holds_the_run(make_flag, run, tmp_path):
+    """Places and shapes of every Gaussian, also of nodes that swing farther than 16 bits say."""
+    write_film(run, tmp_path / "flag.sway")
+    film, simulation = read_bundle(tmp_path / "flag.sway"), make_flag()
+    film = replace(film, order=read_film(run).order)
+    for frame in simulation.frames(FRAMES):
+        check(simulation, film, frame.index, frame.state)
+    film.displacement[2, 5] = [-4.0, 0.001, 1.0]
+    assert np.array_equal(unpack(pack(film)).displacement[2, 5], np.float32([-4.0, 0.001, 1.0]))
+
+
+@pytest.mark.parametrize(
+    ("harm", "words"),
+    [
+        (lambda content: b"PK" + content[2:], "no .sway file"),
+        (lambda content: content[:5], "no .sway file"),
+        (lambda content: content[:4] + b"\x09" + content[5:], "version 9"),
+        (lambda content: content[:-9], "damaged"),
+        (lambda content: content[:400] + b"\0\0\0" + content[403:], "damaged"),
+        (lambda content: content[:8], "damaged"),
+    ],
+)
+def test_a_bundle_that_cannot_be_read(run, tmp_path, harm, words):
+    write_film(run, tmp_path / "flag.sway")
+    (tmp_path / "bad.sway").write_bytes(harm((tmp_path / "flag.sway").read_bytes()))
+    with value_error(words):
+        read_bundle(tmp_path / "bad.sway")
+
+
 def test_nothing_is_lost_in_the_file(run, tmp_path, capsys):
     """What stands in the page is what was put there; the page names nothing outside itself; its size is bounded."""
     assert main(["--web", str(run)]) == 0
@@ -134,16 +141,17 @@ def test_nothing_is_lost_in_the_file(run, tmp_path, capsys):
     assert b"SparkRenderer" in blocks.pop("code")
     film, again = read_film(run), unpack(blocks)
     assert film.head == again.head
-    for name in FIELDS:
-        one, other = getattr(film, name), getattr(again, name)
-        assert one.dtype == other.dtype
-        assert np.array_equal(one, other)
+    _same(film, again)
+    assert main([str(run), str(run / "flag.sway")]) == 0
+    bundle = read_bundle(run / "flag.sway")
+    assert np.array_equal(bundle.displacement, again.displacement)
+    _same(film, bundle)
     assert not re.search(r'(src|href)="(?!data:,)', text)
     for licence in ("WORLD LABS", "three.js authors", "Arjun Barrett"):
         assert licence in text
     data = sum(len(block) for block in pack(film).values())
     head, rest = film.head, len(parts["code"]) + 16_384
-    far = sum(len(split_at(frame, (frame.astype("f2") != frame).any(1))[1]) for frame in film.displacement)
+    far = sum(len(in_steps(frame, head["step"])[1]) for frame in film.displacement)
     raw = 31 * head["count"] + 24 * head["moving"] + 108 * head["stencils"] + 6 * head["nodes"] * head["frames"]
     raw += 4 * head["frames"] + 16 * far + len(blocks["head"])
     assert data == raw
@@ -168,9 +176,7 @@ def test_a_large_film_comes_in_parts(run, monkeypatch):
         ["moving", 0, 30], ["still", 0, 20], ["frames", 0, 4], ["moving", 30, 130], ["still", 20, 120]
     ]  # fmt: skip
     assert list(blocks) == ["head", "stencils", *(f"part-{k}" for k in range(len(head["parts"])))]
-    again = unpack(blocks)
-    for name in FIELDS:
-        assert np.array_equal(getattr(film, name), getattr(again, name)), name
+    _same(film, unpack(blocks))
 
 
 def test_what_comes_first_is_spread_over_all():
@@ -262,7 +268,7 @@ def _refused(capsys, words, *arguments):
 def test_what_is_no_run_of_total_is_refused(make_flag, run, tmp_path, capsys):
     _refused(capsys, "has no run: give the output folder of `gaussian-swaying sim`", tmp_path)
     _refused(capsys, "to end in .html, but got ", run, tmp_path / "film.mp4")
-    _refused(capsys, "--metres-per-unit is not for --web", run, "--metres-per-unit", "2")
+    _refused(capsys, "--metres-per-unit is not for a film", run, "--metres-per-unit", "2")
     copy = shutil.copytree(run, tmp_path / "copy")
     (copy / "nodes.npz").unlink()
     _refused(capsys, "run it again with `recorder.nodes: true`.", copy)
