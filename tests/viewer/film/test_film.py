@@ -5,8 +5,10 @@ import hashlib
 import json
 import re
 import shutil
+import struct
 import zlib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -108,6 +110,38 @@ def test_a_bundle_holds_the_run(make_flag, run, tmp_path):
         check(simulation, film, frame.index, frame.state)
     film.displacement[2, 5] = [-4.0, 0.001, 1.0]
     assert np.array_equal(unpack(pack(film)).displacement[2, 5], np.float32([-4.0, 0.001, 1.0]))
+
+
+def test_another_program_reads_a_bundle(run, tmp_path, capsys, monkeypatch):
+    """By what its page says alone, in numpy; and the example of the page."""
+    monkeypatch.chdir(tmp_path)
+    write_film(run, tmp_path / "flag.sway")
+    content, at, blocks = (tmp_path / "flag.sway").read_bytes(), 8, []
+    while at < len(content):
+        (size,) = struct.unpack_from("<I", content, at)
+        blocks.append(zlib.decompress(content[at + 4 : at + 4 + size]))
+        at += 4 + size
+
+    def planes(block, kind):
+        rows = np.frombuffer(block, np.uint8).reshape(np.dtype(kind).itemsize, -1)
+        return np.ascontiguousarray(rows.T).view(kind)[:, 0]
+
+    head, film = json.loads(blocks[0]), read_bundle("flag.sway")
+    assert content[:8] == b"SWAY\1\0\0\0"
+    assert np.array_equal(planes(blocks[1], "<u4").reshape(-1, 27), film.stencils)
+    places = {kind: blocks[2 + k] for k, (kind, *_) in enumerate(head["parts"])}
+    rows = np.frombuffer(places["moving"], np.uint8).reshape(-1, head["moving"]).T
+    assert np.array_equal(np.ascontiguousarray(rows[:, :12]).view("<f4"), film.position)
+    assert np.array_equal(rows[:, 12:16], film.color)
+    size = 6 * head["nodes"] * head["frames"]
+    v = planes(places["frames"][:size], "<u2").reshape(head["frames"], -1, 3)
+    moved = np.cumsum(v >> 1 ^ -(v & 1), axis=0, dtype=np.uint16).view(np.int16) * head["step"]
+    assert not planes(places["frames"][size : size + 4 * head["frames"]], "<u4").any()
+    assert np.abs(moved - film.displacement).max() < 1e-7
+    text = (Path(__file__).parents[3] / "docs/bundle.md").read_text(encoding="utf-8")
+    ((example, output),) = re.findall(r"```python\n(.*?)```\n\n```text\n(.*?)```", text, flags=re.DOTALL)
+    exec(compile(example, "docs/bundle.md", "exec"), {})
+    assert capsys.readouterr().out == output
 
 
 @pytest.mark.parametrize(
