@@ -11,7 +11,7 @@ from PIL import Image
 
 from gaussian_swaying import suggest
 from gaussian_swaying.gaussians.export import export_cloud
-from gaussian_swaying.scenes.flag_on_stand import FlagOnStandScene
+from gaussian_swaying.scenes import FlagScene
 
 
 def main(folder: Path, splat: Path | None = None, frames: int | None = None, spacing: float = 0.03) -> float:
@@ -26,7 +26,7 @@ def main(folder: Path, splat: Path | None = None, frames: int | None = None, spa
     folder.mkdir(parents=True, exist_ok=True)
     if splat is None:
         splat = folder / "capture.ply"
-        export_cloud(splat, FlagOnStandScene(spacing=spacing).generate())
+        export_cloud(splat, FlagScene(spacing=spacing, stand="pole").generate())
     found = suggest(splat)
     print("\n".join(f"{name}: {reason}" for name, reason in found.reasons.items()))
     Image.fromarray(found.picture()).save(folder / "preview.png")

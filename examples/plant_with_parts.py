@@ -12,8 +12,8 @@ import torch
 from gaussian_swaying import AeroForce, Material, MPMSolver, OrbitCamera, Simulation
 from gaussian_swaying.gaussians.measures import Gaussians
 from gaussian_swaying.gaussians.parts import Part, Parts
-from gaussian_swaying.scenes.ficus import FicusScene
-from gaussian_swaying.scenes.procedural import GivenScene
+from gaussian_swaying.scenes import GivenScene
+from gaussian_swaying.scenes.ficus import ficus
 from gaussian_swaying.simulation.body import Scene
 
 
@@ -29,7 +29,7 @@ def main(folder: Path, frames: int = 50, spacing: float = 0.03, dx: float = 0.08
     import imageio.v3 as iio
 
     folder.mkdir(parents=True, exist_ok=True)
-    cloud = FicusScene(spacing=spacing, leaves=600).generate()
+    cloud = ficus(spacing=spacing, count=600)
     height, green = cloud.means[:, 2], torch.from_numpy(Gaussians.of(cloud).green)
     label = torch.where(green, 3, 2)  # leaves and wood
     label[(height < 0.32) & ~green] = 1  # the pot and its soil

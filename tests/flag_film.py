@@ -10,7 +10,6 @@ import yaml
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.recording.video import VideoEncoder
 from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
-from gaussian_swaying.scenes.flag_on_stand import FlagOnStandScene
 from gaussian_swaying.scenes.procedural import FlagScene, both
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -36,7 +35,7 @@ def write_case(folder: Path, size: tuple[int, int], still: float, moving: float,
     """
     width, height = FLAG
     cloth = FlagScene(width, height, spacing, pattern="printed", ripple=0.05).generate()
-    stand = FlagOnStandScene(width, height, spacing).generate()
+    stand = FlagScene(width, height, spacing, stand="pole").generate()
     write_ply(folder / "my.ply", both(cloth, stand.select(torch.arange(len(stand)) >= len(cloth))))
     speed, azimuth = TRUTH["wind.speed"], torch.deg2rad(torch.tensor(TRUTH["wind.azimuth"]))
     pole = {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [0.06, None, None]}}

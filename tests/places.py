@@ -9,7 +9,7 @@ from shared import unit
 from torch import Tensor
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.scenes.alocasia import AlocasiaScene
+from gaussian_swaying.scenes.alocasia import alocasia
 
 SHARES = {"ground": 0.40, "hedges": 0.42, "haze": 0.14}
 """Shares of the Gaussians; the plant and its pot are the rest."""
@@ -75,7 +75,7 @@ def _plant(count: int) -> GaussianCloud:
     """About as many Gaussians of a potted plant, z up, without its floor."""
     spacing = 0.02
     for _ in range(4):
-        cloud = AlocasiaScene(spacing=spacing).generate()
+        cloud = alocasia(spacing=spacing)
         cloud = cloud.select((cloud.means[:, 2] > 0.004) | (cloud.means[:, :2].norm(dim=-1) < 0.05))
         if len(cloud) > 0.9 * count:
             break

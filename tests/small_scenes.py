@@ -16,7 +16,7 @@ from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
-from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
+from gaussian_swaying.scenes import FlagScene, GivenScene
 from gaussian_swaying.simulation.body import Material, Scene, SimulatedScene
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.suggestion.cost import Cost

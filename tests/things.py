@@ -8,9 +8,9 @@ from shared import unit
 from small_scenes import GREEN, coloured, plain_cloud, together, turned_cloud
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.scenes.alocasia import AlocasiaScene
-from gaussian_swaying.scenes.ficus import FicusScene
-from gaussian_swaying.scenes.flag_on_stand import FlagOnStandScene
+from gaussian_swaying.scenes import FlagScene
+from gaussian_swaying.scenes.alocasia import alocasia
+from gaussian_swaying.scenes.ficus import ficus
 
 AWAY = (3.0, 4.0, 5.0)
 """An origin far from a thing says nothing about its ends."""
@@ -184,18 +184,18 @@ def sign(width=0.03):
 
 def potted_plant(spacing=0.01, reach=0.6):
     """The plant of the paper, with the floor near its pot."""
-    cloud = AlocasiaScene(spacing=spacing).generate()
+    cloud = alocasia(spacing=spacing)
     return cloud.select(cloud.means[:, :2].norm(dim=-1) < reach)
 
 
 def small_tree(spacing=0.02):
     """A tree without its pot, 1.6 m high, its lowest branches at a quarter of it."""
-    cloud = FicusScene(spacing=spacing).generate()
+    cloud = ficus(spacing=spacing)
     return cloud.select((cloud.means[:, :2].norm(dim=-1) < 0.9) & (cloud.means[:, 2] > 0.32))
 
 
 def flag_on_a_pole(**settings):
-    return FlagOnStandScene(**{"spacing": 0.025, **settings}).generate()
+    return FlagScene(**{"spacing": 0.025, "stand": "pole", **settings}).generate()
 
 
 def as_captured(cloud, seed=0):

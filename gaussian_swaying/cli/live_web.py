@@ -10,6 +10,7 @@ from pathlib import Path
 from gaussian_swaying import _program as program
 from gaussian_swaying._files import check_page
 from gaussian_swaying.cli.scene import settings_of, words_of
+from gaussian_swaying.config.parser import scene_name
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.live_web.budget import TARGETS, fitted
 from gaussian_swaying.viewer.live_web.page import ELEMENT, write_element, write_live_web
@@ -59,14 +60,12 @@ def export_live_web(arguments: Sequence[str]) -> None:
         if settings.contact is not None:
             settings.contact = None
             notes.append("the page has no `contact` of the material with itself: layers may pass through each other.")
-        splat = settings.scene.ply
-        made = getattr(settings.scene.generator, "class_path", "scene").rsplit(".", 1)[-1].removesuffix("Scene")
         if options.target is None:
             simulation = Simulation.from_settings(parser, settings)
         else:
             simulation, sentence = fitted(parser, settings, options.target)
             print(sentence)
-    film = write_live_web(simulation, made if splat is None else Path(splat).stem, target)
+    film = write_live_web(simulation, scene_name(settings), target)
     for note in (*notes, *film.notes):
         print(f"note: {note.replace('the film', 'the page')}")
     print(f"{film.head['count']:,} Gaussians, {simulation.model.points.count:,} material points")

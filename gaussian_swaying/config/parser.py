@@ -24,6 +24,7 @@ from gaussian_swaying import _program as program
 from gaussian_swaying._checks import check_frames, check_positive
 from gaussian_swaying._yaml_limits import limit_yaml
 from gaussian_swaying.captures.capture_camera import CaptureCamera
+from gaussian_swaying.config.gone import refuse_gone
 from gaussian_swaying.config.material_names import NAMES, with_material_option, with_named_materials
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.rendering.cameras.keyframes import KeyframedCamera
@@ -79,7 +80,7 @@ def build_parser(schema: type) -> ArgumentParser:
     """
     from jsonargparse import ActionYesNo
 
-    limit_yaml(with_named_materials)
+    limit_yaml(lambda found: with_named_materials(refuse_gone(found)))
     parser = _parser_class()(
         prog=program.name("sim"),
         exit_on_error=False,
@@ -280,6 +281,15 @@ def config_text(parser: ArgumentParser, settings: Namespace) -> str:
     for name in (*RUN_ONLY, *(name for name in CUSTOM if kept.get(name) is None)):
         kept.pop(name, None)
     return str(parser.dump(kept, skip_validation=True))
+
+
+def scene_name(settings: Namespace) -> str:
+    """What a page or a file of a scene is called: its splat, or what its generator makes."""
+    if settings.scene.ply is not None:
+        return Path(settings.scene.ply).stem
+    made = settings.scene.generator
+    named = made and made.init_args.get("kind")
+    return named or getattr(made, "class_path", "scene").rsplit(".", 1)[-1].removesuffix("Scene")
 
 
 def python_text(heading: str, arguments: Mapping[str, Any]) -> str:

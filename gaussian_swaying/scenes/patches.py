@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.geometry.covariances import covariance_to_quat_scale
-from gaussian_swaying.scenes.procedural import painted_cloud
 
 LIGHT = (-0.4, -0.7, 0.6)  # direction towards the light that is baked into the colours
 
@@ -306,3 +306,17 @@ def facing(direction: Tensor, up: Tensor) -> Tensor:
     y = torch.nn.functional.normalize(direction, dim=-1)
     x = torch.nn.functional.normalize(torch.linalg.cross(y, up), dim=-1)
     return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)
+
+
+def painted_cloud(
+    means: Tensor, quats: Tensor, scales: Tensor, colours: Tensor, opacity: float, normals: Tensor | None = None
+) -> GaussianCloud:
+    """Gaussians with one colour each, from 0 to 1, and one opacity for all; the rest as in a GaussianCloud."""
+    return GaussianCloud(
+        means=means.float(),
+        quats=quats.float(),
+        scales=scales.float().contiguous(),
+        opacities=torch.full((len(means),), math.log(opacity / (1 - opacity))),
+        sh=((colours - 0.5) / SH_DC).float()[:, None, :],
+        normals=None if normals is None else normals.float(),
+    )

@@ -13,8 +13,9 @@ from torch import Tensor
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying._fixed import Fixed
 from gaussian_swaying.gaussians.cloud import GaussianCloud, joined
-from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.geometry.patches import smallest_axis_normal
+from gaussian_swaying.scenes.flag_stands import Stand, stand_patches
+from gaussian_swaying.scenes.patches import join, painted_cloud, to_cloud
 from gaussian_swaying.scenes.printed_cloth import printed_colours
 
 _MOST = 50_000_000  # Gaussians, about 100 GB
@@ -41,20 +42,6 @@ class ProceduralScene(Fixed, ABC):
             check_positive(f"generator.{name}", given[name])
         if given["spacing"] > coarsest:
             raise ValueError(f"Expected `generator.spacing` of at most {coarsest} m, but got {given['spacing']} m.")
-
-
-def painted_cloud(
-    means: Tensor, quats: Tensor, scales: Tensor, colours: Tensor, opacity: float, normals: Tensor | None = None
-) -> GaussianCloud:
-    """Gaussians with one colour each, from 0 to 1, and one opacity for all; the rest as in a GaussianCloud."""
-    return GaussianCloud(
-        means=means.float(),
-        quats=quats.float(),
-        scales=scales.float().contiguous(),
-        opacities=torch.full((len(means),), math.log(opacity / (1 - opacity))),
-        sh=((colours - 0.5) / SH_DC).float()[:, None, :],
-        normals=None if normals is None else normals.float(),
-    )
 
 
 def both(first: GaussianCloud, second: GaussianCloud) -> GaussianCloud:
@@ -96,7 +83,10 @@ class FlagScene(ProceduralScene):
             edge is not straight, and cannot turn without strain. Compare only flags with the same ripple.
         pattern: ``stripes`` (three bands of colour and a disc), ``white``, or ``printed``, with features everywhere
             (see :func:`~gaussian_swaying.scenes.printed_cloth.printed_colours`).
-        yaw: Angle by which the flag is turned about its pole side, counter-clockwise seen from above [degrees].
+        yaw: Angle by which flag and stand are turned about the pole side, counter-clockwise seen from above [degrees].
+        stand: Shows where the flag is held, outside its box [0, width] x [-0.005, 0.005] x [0, height] before it is
+            turned, so that ``scene.region`` can be that box: ``pole`` along the left edge, ``posts`` with clips at all
+            corners but the lower left, or ``rod`` along the top edge, on ropes.
     """
 
     width: float = 1.2
@@ -106,6 +96,7 @@ class FlagScene(ProceduralScene):
     ripple: float = 0.003
     pattern: Literal["stripes", "white", "printed"] = "stripes"
     yaw: float = 0.0
+    stand: Stand = "none"
 
     def __post_init__(self) -> None:
         self.check("width", "height", "overlap")
@@ -120,6 +111,7 @@ class FlagScene(ProceduralScene):
             raise ValueError(f"Expected `generator.yaw` to be a finite angle in degrees, but got {self.yaw}.")
 
     def generate(self) -> GaussianCloud:
+        """Make the flag, and then its stand."""
         h = self.spacing
         columns, rows = round(self.width / h), round(self.height / h)
         u = (torch.arange(columns, dtype=torch.float64) + 0.5) * h
@@ -137,7 +129,15 @@ class FlagScene(ProceduralScene):
         quats = math.sqrt(0.5) * torch.stack([cosine, -cosine, -sine, sine], dim=-1)
         sigma = self.overlap * h
         scales = torch.tensor([sigma, sigma, 0.1 * sigma], dtype=torch.float64).log().expand(len(x), 3)
-        return painted_cloud(means, quats, scales, self._colours(x, z), 0.99)
+        flag = painted_cloud(means, quats, scales, self._colours(x, z), 0.99)
+        if self.stand == "none":
+            return flag
+        matrix = torch.tensor(
+            [[math.cos(turn), -math.sin(turn), 0.0], [math.sin(turn), math.cos(turn), 0.0], [0.0, 0.0, 1.0]],
+            dtype=torch.float64,
+        )
+        parts = stand_patches(self.stand, self.width, self.height, min(h, 0.02))
+        return both(flag, to_cloud(join(parts).mapped(matrix), two_sided=False))
 
     def _colours(self, x: Tensor, z: Tensor) -> Tensor:
         if self.pattern == "white":

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.scenes.procedural import ProceduralScene, painted_cloud
+from gaussian_swaying.scenes.patches import painted_cloud
+from gaussian_swaying.scenes.procedural import ProceduralScene
 
 # balls (x, y, z, radius) of the figure, for a height of 1: body, head, muzzle, ears, arms, legs; it looks along -y
 FIGURE = (

@@ -32,6 +32,7 @@ from gaussian_swaying.config.parser import (
     config_text,
     parse_file,
     python_text,
+    scene_name,
     with_custom,
 )
 from gaussian_swaying.gaussians.cloud import GaussianCloud
@@ -734,8 +735,7 @@ class RecordedRun:
                 raise ValueError(
                     f"The splat {splat} has changed since the run in {self.folder}: restore it, or run again."
                 )
-        made = getattr(settings.scene.generator, "class_path", "scene").rsplit(".", 1)[-1].removesuffix("Scene")
-        return Simulation.from_settings(parser, settings, device="cpu"), made if splat is None else Path(splat).stem
+        return Simulation.from_settings(parser, settings, device="cpu"), scene_name(settings)
 
     @cached_property
     def start(self) -> Any:

@@ -17,9 +17,8 @@ from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.gaussians.export import export_cloud
 from gaussian_swaying.gaussians.ply import write_ply
-from gaussian_swaying.scenes.alocasia import AlocasiaScene
-from gaussian_swaying.scenes.flag_on_stand import FlagOnStandScene
-from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.scenes import FlagScene
+from gaussian_swaying.scenes.alocasia import alocasia
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer import controls
 from gaussian_swaying.viewer.controls import settings_of_splat
@@ -85,7 +84,7 @@ def test_a_splat_gets_what_the_preview_suggests(parser, tmp_path):
 def test_a_plant_in_a_pot_moves_in_it(parser, tmp_path):
     """Its parts are in a file that the settings name."""
     path = tmp_path / "plant.ply"
-    write_ply(path, AlocasiaScene(spacing=0.005).generate())
+    write_ply(path, alocasia(spacing=0.005))
     settings = settings_of_splat(parser, path, torch.device("cpu"), tmp_path, quick=True)
     assert settings.scene.parts == str(tmp_path / "parts.npz")
     scene = Simulation.from_settings(parser, settings).scene
@@ -176,7 +175,7 @@ def test_ctrl_c_ends_it_cleanly(tmp_path):
 def test_a_splat_has_the_wind_of_its_preview(tmp_path):
     """Of a cloth, too, whose stretch of the turbulence is looked for without modes."""
     splat = tmp_path / "flag.ply"
-    export_cloud(splat, FlagOnStandScene(spacing=0.05).generate())
+    export_cloud(splat, FlagScene(spacing=0.05, stand="pole").generate())
     parser = Simulation.parser()
     live = controls.settings_of_splat(parser, splat, torch.device("cpu"), tmp_path)
     assert preview([str(splat), "--output", str(tmp_path / "look"), "--device", "cpu"]) == 0

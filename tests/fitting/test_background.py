@@ -10,7 +10,7 @@ from shared import value_error
 from gaussian_swaying.fitting.cameras import Background
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.rendering.cameras.camera import project
-from gaussian_swaying.scenes.procedural import GivenScene
+from gaussian_swaying.scenes import GivenScene
 from gaussian_swaying.simulation.body import Scene
 from gaussian_swaying.simulation.simulation import Simulation
 

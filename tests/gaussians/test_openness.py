@@ -13,8 +13,8 @@ from gaussian_swaying.gaussians.area import coverage_area
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.gaussians.openness import LEAST, _split, openness
 from gaussian_swaying.geometry.rotations import quat_to_rotation
-from gaussian_swaying.scenes.ficus import FicusScene
-from gaussian_swaying.scenes.leaves import LeavesScene
+from gaussian_swaying.scenes.ficus import ficus
+from gaussian_swaying.scenes.leaves import leafy_branch
 from gaussian_swaying.scenes.procedural import FlagScene
 
 
@@ -111,12 +111,12 @@ def test_areas_of_the_model_are_weighed():
 @pytest.mark.parametrize(("leaves", "least"), [(50, 0.96), (150, 0.9)])
 def test_leaves_that_shade_each_other_keep_most_of_their_area(leaves, least):
     """A leaf that is reached through a gap counts fully; some leaves are hidden between others from all sides."""
-    assert least < share(*weights(bodies.of_cloud(LeavesScene(leaves=leaves).generate()))) <= 1
+    assert least < share(*weights(bodies.of_cloud(leafy_branch(count=leaves)))) <= 1
 
 
 def test_a_crown_keeps_its_outer_leaves_and_loses_some_inside():
     """A known limit (docs/validation.md): leaves of a bunch look like the layers of a hazy skin."""
-    body = bodies.of_cloud(FicusScene(leaves=300).generate(), above=bodies.CROWN)
+    body = bodies.of_cloud(ficus(count=300), above=bodies.CROWN)
     found = weights(body)
     assert 0.8 < share(*found) <= 1
     away = (body.means - body.means.mean(0)).norm(dim=-1)

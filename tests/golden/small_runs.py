@@ -18,10 +18,10 @@ from gaussian_swaying.rendering.torch_renderer import TorchRenderer
 from gaussian_swaying.scenes import FlagScene
 
 CONFIGS = Path(__file__).parents[2] / "configs"
-SPACING, SPARSE = "scene.generator.init_args.spacing", "scene.generator.init_args.leaves"
+SPACING, SPARSE = "scene.generator.init_args.spacing", "scene.generator.init_args.count"
 FLAG = {SPACING: 0.06, "solver.dx": 0.14}
 CLOTH = {
-    "scene.generator": {"class_path": "FlagScene", "init_args": {"overlap": 0.6}},
+    "scene.generator": {"class_path": "FlagScene", "init_args": {"overlap": 0.6, "stand": "none"}},
     "scene.region": {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [None] * 3}},
     "contact": None,
     "material.E": 5e4,

@@ -16,7 +16,10 @@ from places import place
 from small_scenes import GREEN, shrub, young_tree
 
 from gaussian_swaying import suggest
-from gaussian_swaying.scenes import FlagScene, LeavesScene, TelephoneScene, VaseScene
+from gaussian_swaying.scenes import FlagScene
+from gaussian_swaying.scenes.leaves import leafy_branch
+from gaussian_swaying.scenes.telephone import telephone
+from gaussian_swaying.scenes.vase import vase
 from gaussian_swaying.simulation.simulation import classify
 
 FILE = Path(__file__).parent / "files" / "suggestions.json"
@@ -37,9 +40,9 @@ CASES = {
     "flag_on_a_pole": (things.flag_on_a_pole, {}),
     "plant": (lambda: things.potted_plant(0.02), {}),
     "tree": (things.small_tree, {}),
-    "leaves": (lambda: LeavesScene(spacing=0.02).generate(), {}),
-    "telephone": (lambda: TelephoneScene(spacing=0.02).generate(), {}),
-    "vase": (lambda: VaseScene(spacing=0.02).generate(), {}),
+    "leaves": (lambda: leafy_branch(spacing=0.02), {}),
+    "telephone": (lambda: telephone(spacing=0.02), {}),
+    "vase": (lambda: vase(spacing=0.02), {}),
     "garden": (lambda: place(20_000, sh_degree=0)[0], {}),
     "washing_line": (lambda: things.plain_cloud(things.washing_line()[1], -4.0, logit=2.0), UP),
     "sign": (things.sign, UP),

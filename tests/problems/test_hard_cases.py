@@ -34,7 +34,7 @@ from gaussian_swaying.geometry.linalg import determinant, matmul3
 from gaussian_swaying.mpm.colliders import EnclosingBox, Plane, VelocityBox
 from gaussian_swaying.mpm.laws import LAWS as KINDS
 from gaussian_swaying.mpm.pins import Handle
-from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
+from gaussian_swaying.scenes import FlagScene, GivenScene
 from gaussian_swaying.simulation.measure import measure
 from gaussian_swaying.wind.field import FlowKey, Modulation
 

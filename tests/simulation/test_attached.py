@@ -10,7 +10,7 @@ from small_scenes import together
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
+from gaussian_swaying.scenes import FlagScene, GivenScene
 from gaussian_swaying.simulation.body import Material, Scene, attached_points, homes, lies_apart, pieces_in_cells
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.suggestion.suggest import why_apart

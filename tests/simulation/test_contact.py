@@ -13,8 +13,7 @@ from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.colliders import BallObstacle, StillGaussians
 from gaussian_swaying.mpm.contact import Contact
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.scenes.cloths import ClothScene
-from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
+from gaussian_swaying.scenes import DemoScene, FlagScene, GivenScene
 from gaussian_swaying.simulation.body import Material, Scene, still_distance
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -22,7 +21,9 @@ from gaussian_swaying.simulation.simulation import Simulation
 def _ball(contact=None, boundaries=None, **more):
     """A small cloth above the ball of radius 0.3 m."""
     scene = Scene(
-        generator=ClothScene("ball", 0.6, 0.03), region=Box([None, None, 0.67], [None, None, 0.69]), metres_per_unit=1.0
+        generator=DemoScene("cloth_over_ball", 0.03, size=0.6),
+        region=Box([None, None, 0.67], [None, None, 0.69]),
+        metres_per_unit=1.0,
     )
     given = [BallObstacle([0, 0, 0.35], 0.3)] if boundaries is None else boundaries
     solver = MPMSolver(0.06, boundaries=given, **more)
@@ -54,7 +55,7 @@ def test_gaussians_that_stand_still_are_an_obstacle():
 
 
 def test_the_distance_from_gaussians_is_that_of_the_ball_that_they_cover():
-    cloud = ClothScene("ball", 0.6, 0.03).generate()
+    cloud = DemoScene("cloth_over_ball", 0.03, size=0.6).generate()
     ball = cloud.select((cloud.means - torch.tensor([0.0, 0.0, 0.35])).norm(dim=-1) < 0.31)
     model = GaussianSurfaceModel.from_cloud(ball, requires_grad=False)
     corner = double([0.5, 0.5, 0.5])
@@ -88,7 +89,7 @@ def test_surfaces_that_start_too_close_are_warned_of(gap, warned):
 def test_a_configuration_turns_contact_on(tmp_path):
     text = """
 scene:
-  generator: {class_path: ClothScene, init_args: {setting: ball, side: 0.4, spacing: 0.04}}
+  generator: {class_path: DemoScene, init_args: {kind: cloth_over_ball, size: 0.4, spacing: 0.04}}
   region: {class_path: Box, init_args: {min: [null, null, 0.67], max: [null, null, 0.69]}}
   metres_per_unit: 1.0
 contact: {thickness: 0.007, friction: 0.1}

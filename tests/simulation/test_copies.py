@@ -22,7 +22,7 @@ from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera
 from gaussian_swaying.rendering.shading import DiffuseShader
-from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
+from gaussian_swaying.scenes import FlagScene, GivenScene
 from gaussian_swaying.simulation.body import Material, Scene
 from gaussian_swaying.simulation.model import Copy, Edit
 from gaussian_swaying.simulation.simulation import Simulation

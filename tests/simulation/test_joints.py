@@ -8,7 +8,7 @@ from small_scenes import together
 
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
+from gaussian_swaying.scenes import FlagScene, GivenScene
 from gaussian_swaying.simulation.body import Material, Scene
 from gaussian_swaying.simulation.model import Edit
 from gaussian_swaying.simulation.simulation import Simulation

@@ -12,7 +12,7 @@ from shared import beyond, in_both, peak, up_to, value_error
 
 from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
+from gaussian_swaying.scenes import FlagScene, GivenScene
 from gaussian_swaying.simulation.body import Material, MaterialRegion, Scene
 from gaussian_swaying.simulation.simulation import Simulation
 

@@ -14,8 +14,7 @@ from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.kernels.language import INTERPRETED
 from gaussian_swaying.mpm.laws.elastic import NeoHookean
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.scenes.leaves import LeavesScene
-from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
+from gaussian_swaying.scenes import DemoScene, FlagScene, GivenScene
 from gaussian_swaying.scenes.solid import SolidScene
 from gaussian_swaying.simulation.body import Material, MaterialRegion, Scene, SimulatedScene, matched_points
 from gaussian_swaying.simulation.measure import measure
@@ -331,7 +330,7 @@ def test_recorded_measurements_are_those_of_the_frame(make_simulation):
 @pytest.mark.parametrize("scene", ["flag", "leaves", "noise"])
 def test_wind_on_the_groups_of_a_scene_is_that_on_its_patches(law, scene, make_cloud, make_scene):
     """Within 1 % of the sum over the patches, in any direction, for moving and turned groups."""
-    cloud = {"flag": fine_flag, "leaves": LeavesScene(spacing=0.01).generate, "noise": lambda: make_cloud(4000)}[
+    cloud = {"flag": fine_flag, "leaves": DemoScene("leaves", 0.01).generate, "noise": lambda: make_cloud(4000)}[
         scene
     ]()
     dx = 0.3 if scene == "noise" else 0.1

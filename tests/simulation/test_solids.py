@@ -14,7 +14,7 @@ from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
-from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
+from gaussian_swaying.scenes import FlagScene, GivenScene
 from gaussian_swaying.scenes.solid import SolidScene
 from gaussian_swaying.simulation.body import Material, MaterialRegion, Scene, SimulatedScene, cell_volume
 from gaussian_swaying.simulation.simulation import Simulation

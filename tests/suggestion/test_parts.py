@@ -31,20 +31,19 @@ from things import (
 from gaussian_swaying.gaussians.cloud import joined
 from gaussian_swaying.gaussians.measures import Gaussians
 from gaussian_swaying.mpm.materials import MATERIALS
-from gaussian_swaying.scenes.alocasia import AlocasiaScene
-from gaussian_swaying.scenes.ficus import FicusScene
-from gaussian_swaying.scenes.flag_on_stand import FlagOnStandScene
-from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.scenes import FlagScene
+from gaussian_swaying.scenes.alocasia import alocasia as alocasia_of
+from gaussian_swaying.scenes.ficus import ficus
 from gaussian_swaying.scenes.solid import SolidScene
-from gaussian_swaying.scenes.telephone import TelephoneScene
-from gaussian_swaying.scenes.vase import VaseScene
+from gaussian_swaying.scenes.telephone import telephone
+from gaussian_swaying.scenes.vase import vase
 from gaussian_swaying.suggestion import parts as finders
 from gaussian_swaying.suggestion.kinds import KINDS, STEM_E
 
 
 @pytest.fixture(scope="module")
 def alocasia():
-    return AlocasiaScene(spacing=0.005).generate()
+    return alocasia_of(spacing=0.005)
 
 
 def found(cloud, *more, by=finders.potted_plant, up=(0.0, 0.0, 1.0), simulated=None):
@@ -106,7 +105,7 @@ def test_haze_goes_with_what_it_lies_on(alocasia):
 
 
 def test_a_tree_has_a_brown_stem():
-    cloud = FicusScene(spacing=0.01).generate()
+    cloud = ficus(spacing=0.01)
     plant, (x, y, z) = found(cloud), cloud.means.unbind(-1)
     across = torch.hypot(x, y)
     assert share(plant.mask("pot"), (across > 0.14) & (across < 0.22) & (z > 0.05) & (z < 0.25)) > 0.99
@@ -122,9 +121,9 @@ def test_a_pot_without_soil_is_held(alocasia):
     assert "soil" not in plant.names
 
 
-@pytest.mark.parametrize("scene", [VaseScene, TelephoneScene, SolidScene, FlagScene])
+@pytest.mark.parametrize("scene", [vase, telephone, SolidScene().generate, FlagScene().generate])
 def test_other_objects_have_no_parts(scene):
-    assert found(scene().generate()) is None
+    assert found(scene()) is None
 
 
 def test_a_pot_alone_and_a_plant_alone_have_no_parts(alocasia):
@@ -154,7 +153,7 @@ def test_a_plant_moves_in_its_pot(tmp_path):
     given = guess(cloud, up="+z", hold="bottom", quality="draft")
     assert given.parts is None
     assert given.pin is not None
-    place = guess(AlocasiaScene(spacing=0.01).generate(), up="+z")
+    place = guess(alocasia_of(spacing=0.01), up="+z")
     assert place.kind == "plant"
     assert 0.5 < place.longest_side <= 1.0
 
@@ -186,7 +185,7 @@ def test_any_axis_may_be_up_and_the_pole_may_be_below_only():
 
 def test_a_flag_without_its_pole_or_with_two_or_on_a_rod_has_no_pole():
     for kind in ("posts", "rod", "none"):
-        cloud = FlagOnStandScene(stand=kind).generate()
+        cloud = FlagScene(stand=kind).generate()
         assert finders.flag_on_pole(Gaussians.of(cloud), torch.tensor([0.0, 0.0, 1.0]).numpy()) is None
         assert (guess(cloud).parts is None) == (kind != "posts")
     assert guess(FlagScene().generate()).parts is None

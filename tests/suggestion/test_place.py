@@ -13,8 +13,7 @@ from gaussian_swaying import suggest
 from gaussian_swaying.gaussians.measures import Gaussians
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
-from gaussian_swaying.scenes.alocasia import AlocasiaScene
-from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.scenes import DemoScene, FlagScene
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.suggestion.moves import move_things, survey
 from gaussian_swaying.suggestion.up import given_up
@@ -110,7 +109,7 @@ def test_a_given_direction_is_the_only_one_that_is_tried(garden, up):
         assert len(found.things) == 2
 
 
-@pytest.mark.parametrize("scene", [AlocasiaScene(spacing=0.02), FlagScene(spacing=0.03)], ids=["plant", "flag"])
+@pytest.mark.parametrize("scene", [DemoScene("alocasia", 0.02), FlagScene(spacing=0.03)], ids=["plant", "flag"])
 def test_an_object_is_no_place(scene):
     """Even on a floor of its own: there is a single thing, and nothing far away."""
     assert survey(Gaussians.of(scene.generate())) is None

@@ -21,7 +21,7 @@ from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.recording.nodes import join_far, load_nodes, split_far
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
-from gaussian_swaying.scenes.procedural import FlagScene, GivenScene
+from gaussian_swaying.scenes import FlagScene, GivenScene
 from gaussian_swaying.simulation.body import Material, Scene
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.film import page as film_page

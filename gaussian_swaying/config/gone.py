@@ -1,0 +1,50 @@
+"""Names that configurations no longer have, and what took their place."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+_KINDS = {
+    "Alocasia": "alocasia",
+    "FicusBehindWall": "ficus_behind_wall",
+    "Ficus": "ficus",
+    "Leaves": "leaves",
+    "PlantRow": "plant_row",
+    "Sand": "sand",
+    "Telephone": "telephone",
+    "Vase": "vase",
+}
+
+GONE = {
+    **{f"{name}Scene": f"DemoScene with `kind: {kind}` and `count`" for name, kind in _KINDS.items()},
+    "ClothScene": "DemoScene with `kind` cloth_over_ball, cloth_over_table, ball_on_cloth or two_flags, and `size`",
+    "FlagOnStandScene": "FlagScene with `stand: pole`",
+}
+"""What to use in place of classes, fields of classes (``Class.field``) and other fields (``scene.field``)."""
+
+
+def refuse_gone(found: Any, within: str = "") -> Any:
+    """Return what was read from YAML; ValueError if it has a name that is gone.
+
+    Args:
+        found: A mapping, a list or a value.
+        within: The class or the field that it belongs to.
+    """
+    if isinstance(found, Mapping):
+        kind = str(found.get("class_path", "")).rpartition(".")[-1]
+        for name, value in found.items():
+            own = kind if name == "init_args" else f"{within}.{name}".lstrip(".")
+            _refuse(own)
+            refuse_gone(value, own)
+    elif isinstance(found, list):
+        for value in found:
+            refuse_gone(value, within)
+    elif isinstance(found, str):
+        _refuse(found.rpartition(".")[-1])
+    return found
+
+
+def _refuse(name: str) -> None:
+    if name in GONE:
+        raise ValueError(f"`{name}` is gone: use {GONE[name]}.")
