@@ -5,6 +5,7 @@ from pathlib import Path
 import torch
 
 from gaussian_swaying.geometry.distance import DistanceGrid
+from gaussian_swaying.geometry.regions import Box, Capsule, HalfSpace, Mesh, Sphere, StillGaussians
 from gaussian_swaying.mpm import colliders, pins
 from gaussian_swaying.mpm.boundary import Boundary
 from gaussian_swaying.mpm.laws import LAWS
@@ -14,7 +15,7 @@ BOUNDARIES = {
     for file in (colliders, pins)
     for name, found in vars(file).items()
     if getattr(found, "__module__", "") == file.__name__ and isinstance(found, type)
-    if issubclass(found, Boundary) and found is not colliders.Obstacle
+    if issubclass(found, Boundary)
 }
 """The boundary conditions of the package by name."""
 
@@ -42,18 +43,18 @@ def _still(**more):
     """A ball made of distances, as a simulation makes them of Gaussians; in metres, whatever the frame."""
     axis = torch.arange(8, dtype=torch.float64) * 0.1 - 0.33
     nodes = torch.cartesian_prod(axis, axis, axis).reshape(8, 8, 8, 3)
-    obstacle = BOUNDARIES["StillGaussians"](**more)
+    obstacle = BOUNDARIES["Obstacle"](StillGaussians(), **more)
     obstacle.take(DistanceGrid((nodes - 0.03).norm(dim=-1) - 0.26, nodes[0, 0, 0], 0.1))
     return obstacle
 
 
 OBSTACLES = {
-    "ball": lambda **more: BOUNDARIES["BallObstacle"]([0.1, 0.2, 0.2], 0.15, **more),
-    "capsule": lambda **more: BOUNDARIES["CapsuleObstacle"]([0.01, 0.13, 0.2], [0.31, 0.3, 0.13], 0.11, **more),
-    "capsule that is a ball": lambda **more: BOUNDARIES["CapsuleObstacle"](*[[0.1, 0.2, 0.2]] * 2, 0.11, **more),
-    "block": lambda **more: BOUNDARIES["BoxObstacle"]([0.0, 0.1, 0.2], [0.3, 0.3, 0.4], [20, 0, 40], **more),
-    "ground": lambda **more: BOUNDARIES["HalfSpaceObstacle"]([0.1, 0.2, 0.2], [0.0, 0.3, 1.0], **more),
-    "mesh": lambda **more: BOUNDARIES["MeshObstacle"](MESH, 12, [0.113, 0.207, 0.181], **more),
+    "ball": lambda **more: BOUNDARIES["Obstacle"](Sphere([0.1, 0.2, 0.2], 0.15), **more),
+    "capsule": lambda **more: BOUNDARIES["Obstacle"](Capsule([0.01, 0.13, 0.2], [0.31, 0.3, 0.13], 0.11), **more),
+    "capsule that is a ball": lambda **more: BOUNDARIES["Obstacle"](Capsule(*[[0.1, 0.2, 0.2]] * 2, 0.11), **more),
+    "block": lambda **more: BOUNDARIES["Obstacle"](Box([0.0, 0.1, 0.2], [0.3, 0.3, 0.4]), rotation=[20, 0, 40], **more),
+    "ground": lambda **more: BOUNDARIES["Obstacle"](HalfSpace([0.1, 0.2, 0.2], [0.0, 0.3, 1.0]), **more),
+    "mesh": lambda **more: BOUNDARIES["Obstacle"](Mesh(MESH, 12, [0.113, 0.207, 0.181]), **more),
     "still": _still,
 }
 

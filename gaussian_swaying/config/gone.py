@@ -19,6 +19,8 @@ _KINDS = {
 GONE = {
     **{f"{name}Scene": f"DemoScene with `kind: {kind}` and `count`" for name, kind in _KINDS.items()},
     "ClothScene": "DemoScene with `kind` cloth_over_ball, cloth_over_table, ball_on_cloth or two_flags, and `size`",
+    **{f"{name}Obstacle": f"Obstacle with `shape: {name}`" for name in ("Box", "Capsule", "HalfSpace", "Mesh")},
+    "BallObstacle": "Obstacle with `shape: Sphere`",
     "FlagOnStandScene": "FlagScene with `stand: pole`",
 }
 """What to use in place of classes, fields of classes (``Class.field``) and other fields (``scene.field``)."""

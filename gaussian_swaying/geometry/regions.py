@@ -4,13 +4,24 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_shape, check_vector
 from gaussian_swaying._fixed import Fixed
+from gaussian_swaying.geometry.distance import (
+    DistanceGrid,
+    ball_distance,
+    box_distance,
+    capsule_distance,
+    distance_at,
+    grid_distance,
+    half_space_distance,
+)
 from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.meshes import mesh_distance, read_mesh
 
 
 class Region(Fixed, ABC):
@@ -20,10 +31,15 @@ class Region(Fixed, ABC):
         recordable: Whether a CUDA graph may record :meth:`contains`. That is so if it copies nothing from or to the
             host after the first call (see :meth:`on`). A class that overrides ``contains`` must set this itself.
         axes: The axes in which the region is given, in words; empty for those of the points passed to it.
+        distance: For the shape of an obstacle, the device function of its distance
+            (:mod:`~gaussian_swaying.geometry.distance`).
+        middle: The place about which it turns; None for a shape without a place of its own.
     """
 
     recordable: bool = False
     axes: str = ""
+    distance: Any = None
+    middle: tuple[float, ...] | None = None
 
     def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
@@ -50,6 +66,15 @@ class Region(Fixed, ABC):
     @abstractmethod
     def contains(self, points: Tensor) -> Tensor:
         """Return a mask (...) of the points (..., 3) [scene units] that are inside."""
+
+    def solid(self, unit: float, axes: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the numbers and the table of :attr:`distance`, around :attr:`middle`.
+
+        Args:
+            unit: Length of a scene unit [m].
+            axes: Axes of the region, in columns, float64, shape (3, 3).
+        """
+        raise ValueError(f"A {type(self).__name__} is not the shape of an obstacle: use a Box or Capsule.")
 
     def bounds(self, points: Tensor) -> tuple[list[float], list[float]]:
         """Smallest and largest coordinates of points (..., 3), in the axes and units in which the region is given."""
@@ -82,6 +107,7 @@ class Box(Region):
     """
 
     recordable = True
+    distance = box_distance
 
     def __init__(self, min: Sequence[float | None], max: Sequence[float | None]) -> None:
         self.min = _corner("min", min, -float("inf"))
@@ -89,6 +115,13 @@ class Box(Region):
         for axis, low, high in zip("xyz", self.min, self.max, strict=True):
             if not low < high:
                 raise ValueError(f"Expected `min` to be below `max` of the box along {axis}, but got {low} and {high}.")
+        self.middle = tuple(0.5 * (low + high) for low, high in zip(self.min, self.max, strict=True))
+
+    def solid(self, unit: float, axes: Tensor) -> tuple[Tensor, Tensor]:
+        half = 0.5 * unit * (axes.new_tensor(self.max) - axes.new_tensor(self.min))
+        if not half.isfinite().all():
+            raise ValueError("Expected `min` and `max` of an obstacle without null.")
+        return torch.cat([half, axes.reshape(-1)]), axes[:0]
 
     def contains(self, points: Tensor) -> Tensor:
         """Return a mask (...) of the points (..., 3) [scene units] that are inside."""
@@ -109,11 +142,15 @@ class Sphere(Region):
     """
 
     recordable = True
+    distance = ball_distance
 
     def __init__(self, center: Sequence[float], radius: float) -> None:
-        self.center = check_vector("center", center)
+        self.center = self.middle = check_vector("center", center)
         check_positive("radius", radius)
         self.radius = float(radius)
+
+    def solid(self, unit: float, axes: Tensor) -> tuple[Tensor, Tensor]:
+        return axes.new_tensor([unit * self.radius]), axes[:0]
 
     def contains(self, points: Tensor) -> Tensor:
         """Return a mask (...) of the points (..., 3) [scene units] that are inside."""
@@ -156,6 +193,128 @@ class Cylinder(Region):
         along = (offset * axis).sum(-1)
         across = (offset - along[..., None] * axis).square().sum(-1)
         return (along.abs() <= 0.5 * self.height) & (across <= self.radius**2)
+
+
+class Capsule(Region):
+    """A rod with round ends: a pole, an arm.
+
+    Args:
+        first: One end of its axis [scene units], 3 numbers.
+        second: The other end.
+        radius: Radius [scene units], above zero.
+    """
+
+    distance = capsule_distance
+
+    def __init__(self, first: Sequence[float], second: Sequence[float], radius: float) -> None:
+        self.first, self.second = check_vector("first", first), check_vector("second", second)
+        check_positive("radius", radius)
+        self.radius = float(radius)
+        self.middle = tuple(0.5 * (p + q) for p, q in zip(self.first, self.second, strict=True))
+
+    def solid(self, unit: float, axes: Tensor) -> tuple[Tensor, Tensor]:
+        half = 0.5 * unit * axes @ (axes.new_tensor(self.second) - axes.new_tensor(self.first))
+        squared = half.square().sum()
+        inverse = torch.where(squared > 0, 1 / squared, 0.0)
+        return torch.cat([axes.new_tensor([unit * self.radius]), half, inverse[None]]), axes[:0]
+
+    def contains(self, points: Tensor) -> Tensor:
+        """Return a mask (...) of the points (..., 3) [scene units] that are inside."""
+        return _within(self, points)
+
+
+class HalfSpace(Region):
+    """All space behind a plane: a floor, a wall.
+
+    Args:
+        point: A point of the plane [scene units], 3 numbers.
+        normal: Direction out of it, 3 numbers of any length above zero.
+    """
+
+    distance = half_space_distance
+
+    def __init__(self, point: Sequence[float], normal: Sequence[float]) -> None:
+        self.point = self.middle = check_vector("point", point)
+        self.normal = check_vector("normal", normal)
+        if not any(self.normal):
+            raise ValueError("Expected `normal` of the half space not to be zero.")
+
+    def solid(self, unit: float, axes: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.nn.functional.normalize(axes @ axes.new_tensor(self.normal), dim=0), axes[:0]
+
+    def contains(self, points: Tensor) -> Tensor:
+        """Return a mask (...) of the points (..., 3) [scene units] that are inside."""
+        return _within(self, points)
+
+
+class Mesh(Region):
+    """A closed triangle mesh.
+
+    Its signed distance is computed on a grid once, so details smaller than a cell of that grid are rounded off.
+
+    Args:
+        file: A .ply or .obj file, in scene units and axes.
+        cells: Cells of the grid along the longest side of the mesh.
+        center: Position of the mesh's origin, about which it turns [scene units].
+
+    Raises:
+        ValueError: If the file is no closed mesh.
+    """
+
+    distance = grid_distance
+
+    def __init__(self, file: str, cells: int = 48, center: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
+        self.center = self.middle = check_vector("center", center)
+        if cells < 4:
+            raise ValueError(f"Expected `cells` of the mesh to be at least 4, but got {cells}.")
+        self.file, self.cells = file, int(cells)
+        self.grid = mesh_distance(*read_mesh(file), cells)
+
+    def solid(self, unit: float, axes: Tensor) -> tuple[Tensor, Tensor]:
+        grid = DistanceGrid(self.grid.values * unit, self.grid.origin * unit, self.grid.spacing * unit)
+        return grid.numbers(axes), grid.values
+
+    def contains(self, points: Tensor) -> Tensor:
+        """Return a mask (...) of the points (..., 3) [scene units] that are inside."""
+        return _within(self, points)
+
+
+class StillGaussians(Region):
+    """Everything in the scene that does not move, as the shape of an obstacle: a curtain falls over a captured table.
+
+    Its surface is where the density of the Gaussians passes a level, on a grid around the object that a
+    ``Simulation`` makes once. Details smaller than a cell are rounded off.
+
+    Args:
+        cells: Cells of the grid along its longest side.
+        level: Density of the surface, from 0 to 1.
+        margin: Distance by which the grid reaches beyond the object at rest, in lengths of its longest side.
+    """
+
+    distance = grid_distance
+
+    def __init__(self, cells: int = 96, level: float = 0.5, margin: float = 1.0) -> None:
+        check_positive("margin", margin)
+        if not 0 < level < 1 or cells < 8:
+            raise ValueError(
+                f"Expected `level` between 0 and 1 and `cells` of at least 8, but got {level:g} and {cells}."
+            )
+        self.cells, self.level, self.margin = int(cells), float(level), float(margin)
+
+    def solid(self, unit: float, axes: Tensor) -> tuple[Tensor, Tensor]:
+        """Nothing, as only a simulation knows the Gaussians."""
+        return axes[0, :0], axes[:0]
+
+    def contains(self, points: Tensor) -> Tensor:
+        """Refuse."""
+        raise ValueError("StillGaussians are the shape of an obstacle, not a region.")
+
+
+def _within(region: Region, points: Tensor) -> Tensor:
+    check_shape("points", points, 3)
+    numbers, table = region.solid(1.0, torch.eye(3, dtype=torch.float64))
+    place = points - region.on(points, region.middle or ())
+    return distance_at(type(region).distance, place, numbers, table)[0] <= 0
 
 
 class Union(Region):

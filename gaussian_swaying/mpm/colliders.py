@@ -18,19 +18,10 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_choice, check_positive, check_vector
 from gaussian_swaying._fixed import FixedList, assign, changed
-from gaussian_swaying.geometry.distance import (
-    DistanceGrid,
-    ball_distance,
-    box_distance,
-    capsule_distance,
-    distance_at,
-    grid_distance,
-    half_space_distance,
-)
+from gaussian_swaying.geometry.distance import DistanceGrid, distance_at, half_space_distance
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.keyed_path import KeyedPath, between, fastest
 from gaussian_swaying.geometry.linalg_triton import add3, dot3, matvec, read, transpose
-from gaussian_swaying.geometry.meshes import mesh_distance, read_mesh
 from gaussian_swaying.geometry.regions import Region
 from gaussian_swaying.geometry.rotations import rotation_of
 from gaussian_swaying.kernels.derive import on_tensors
@@ -267,9 +258,10 @@ class Obstacle(Boundary):
     a cell wide.
 
     Args:
-        center: Origin of its own axes at rest, in scene units.
+        shape: A ``Sphere``, ``Box``, ``Capsule``, ``HalfSpace`` or ``Mesh``, in scene units, or ``StillGaussians``.
         friction: Coulomb coefficient.
         gap: Distance that the material keeps from it [m].
+        rotation: Rotation about its middle, as axis times angle [degrees], in scene axes.
         path: Motion of the obstacle; None for one at rest.
         start: Time from which it acts [s].
         end: Time from which it no longer acts [s]; None for never.
@@ -280,9 +272,10 @@ class Obstacle(Boundary):
 
     def __init__(
         self,
-        center: tuple[float, ...],
+        shape: Region,
         friction: float = 0.3,
         gap: float = 0.0,
+        rotation: Sequence[float] = (0.0, 0.0, 0.0),
         path: KeyedPath | None = None,
         start: float = 0.0,
         end: float | None = None,
@@ -290,34 +283,51 @@ class Obstacle(Boundary):
         super().__init__(start, end)
         check_positive("friction", friction, allow_zero=True)
         check_positive("gap", gap, allow_zero=True)
-        self.friction, self.gap, self.path = float(friction), float(gap), path
-        self.register_buffer("center", torch.tensor(center, dtype=torch.float64))
+        self.shape, self.friction, self.gap, self.path = shape, float(friction), float(gap), path
+        self.rotation = check_vector("rotation", rotation)
+        self.register_buffer("center", torch.tensor(shape.middle or (0.0, 0.0, 0.0), dtype=torch.float64))
         times, moves, turns = KeyedPath([0.0]).keys() if path is None else path.keys()
-        for name, value in (("times", times), ("shifts", moves), ("turns", turns)):
+        for name, value in (("times", times), ("shifts", moves), ("turns", turns), *self._solid(None).items()):
             self.register_buffer(name, value)
         self.center: Tensor
         self.times: Tensor
         self.shifts: Tensor
         self.turns: Tensor
+        self.numbers: Tensor
+        self.table: Tensor
 
-    def in_metres(self, frame: SimFrame, **tensors: Tensor) -> Obstacle:
-        """A copy with its centre and path in metres, and with some tensors replaced."""
+    def _solid(self, frame: SimFrame | None) -> dict[str, Tensor]:
+        """The numbers and the table of its distance in scene units, or in the metres of a frame."""
+        axes = rotation_of(torch.deg2rad(torch.tensor(self.rotation, dtype=torch.float64)))
+        unit, axes = (1.0, axes) if frame is None else (frame.metres_per_unit, frame.rotation @ axes)
+        numbers, table = self.shape.solid(unit, axes)
+        return {"numbers": numbers, "table": table}
+
+    def in_frame(self, frame: SimFrame) -> Obstacle:
+        """The obstacle in metres, z up."""
+        if self.shape.middle is None:
+            return copy.copy(self)
+        tensors = self._solid(frame)
         if self.path is not None:
-            _, moves, turns = self.path.keys(frame)
-            tensors |= {"shifts": moves, "turns": turns}
+            _, tensors["shifts"], tensors["turns"] = self.path.keys(frame)
         return self.copy_in(frame, center=frame.point_to_sim(self.center), **tensors)
+
+    def take(self, found: DistanceGrid) -> None:
+        """Set the grid of distances from ``StillGaussians``, in metres, z up."""
+        assign(self, numbers=found.numbers(torch.eye(3)), table=found.values)
 
     def hold_kind(self, neighbours_fixed: bool) -> str:
         """``surface``: it acts on the surface where particles keep their neighbours, otherwise on ``nodes``."""
         return "surface" if neighbours_fixed else "nodes"
 
-    def solid(self) -> DeviceFunction:
-        """The device function of its distance at rest, and its numbers; a subclass has this or :meth:`distance`."""
-        raise NotImplementedError(f"{type(self).__name__} has neither `solid` nor `distance`.")
-
     def device_function(self) -> DeviceFunction | None:
-        """That of :meth:`solid`, with what :func:`touch` reads."""
-        placed = _placed(self.solid(), self.gap, self.friction, self.center)
+        """That of its shape, with what :func:`touch` reads."""
+        if not len(self.numbers):
+            return None
+        numbers = Numbers(len(self.numbers), lambda: self.numbers)
+        table = Numbers(self.table.numel(), lambda: self.table)
+        solid = DeviceFunction(type(self.shape).distance, numbers=numbers, table=table, sources=(self,))
+        placed = _placed(solid, self.gap, self.friction, self.center)
         return placed if self.still else replace(placed, per_substep=Numbers(POSE.value, self._poses))
 
     def _poses(self, time: Tensor, dt: Tensor, steps: int) -> Tensor:
@@ -334,9 +344,11 @@ class Obstacle(Boundary):
         Returns:
             Distances [m], negative inside, shape (...), and unit vectors (..., 3).
         """
-        solid = self.solid()
-        table = solid.table.take() if solid.table.count else place.new_zeros(1)
-        return distance_at(solid.function, place, solid.numbers.take(), table)
+        if not len(self.numbers):
+            raise RuntimeError(
+                "StillGaussians have no Gaussians yet: give them to a Simulation, which knows the scene."
+            )
+        return distance_at(type(self.shape).distance, place, self.numbers, self.table)
 
     @property
     def still(self) -> bool:
@@ -397,309 +409,6 @@ def _placed(solid: DeviceFunction, gap: float, friction: float, centre: Tensor) 
 
     own = solid.numbers
     return replace(solid, numbers=Numbers(5 + own.count, numbers))
-
-
-def grid_device_function(obstacle: Obstacle, grid: DistanceGrid, axes: Tensor) -> DeviceFunction:
-    """The device function of an obstacle whose distances [m] are on a grid; its axes are columns."""
-    table = Numbers(grid.values.numel(), lambda: grid.values)
-    return DeviceFunction(
-        grid_distance, numbers=Numbers(16, lambda: grid.numbers(axes)), table=table, sources=(obstacle,)
-    )
-
-
-class BallObstacle(Obstacle):
-    """A ball that the material cannot enter.
-
-    Args:
-        center: Its centre, in scene units.
-        radius: Its radius, in scene units.
-        friction: Coulomb coefficient.
-        gap: Distance that the material keeps from it [m].
-        path: Motion of the obstacle; None for one at rest.
-        start: Time from which it acts [s].
-        end: Time from which it no longer acts [s]; None for never.
-    """
-
-    def __init__(
-        self,
-        center: Sequence[float],
-        radius: float,
-        friction: float = 0.3,
-        gap: float = 0.0,
-        path: KeyedPath | None = None,
-        start: float = 0.0,
-        end: float | None = None,
-    ) -> None:
-        super().__init__(check_vector("center", center), friction, gap, path, start, end)
-        check_positive("radius", radius)
-        self.register_buffer("radius", torch.tensor(float(radius), dtype=torch.float64))
-        self.radius: Tensor
-
-    def in_frame(self, frame: SimFrame) -> Obstacle:
-        """The ball in metres, z up."""
-        return self.in_metres(frame, radius=self.radius * frame.metres_per_unit)
-
-    device_function = Obstacle.device_function
-
-    def solid(self) -> DeviceFunction:
-        return DeviceFunction(ball_distance, numbers=Numbers(1, lambda: self.radius), sources=(self,))
-
-
-class BoxObstacle(Obstacle):
-    """A box that the material cannot enter: a table, a step; an ``EnclosingBox`` is one that it cannot leave.
-
-    Args:
-        min: Smallest corner before it is turned, in scene units.
-        max: Largest corner.
-        turn: Rotation about its centre, as axis times angle [degrees], in scene axes.
-        friction: Coulomb coefficient.
-        gap: Distance that the material keeps from it [m].
-        path: Motion of the obstacle; None for one at rest.
-        start: Time from which it acts [s].
-        end: Time from which it no longer acts [s]; None for never.
-    """
-
-    def __init__(
-        self,
-        min: Sequence[float],
-        max: Sequence[float],
-        turn: Sequence[float] = (0.0, 0.0, 0.0),
-        friction: float = 0.3,
-        gap: float = 0.0,
-        path: KeyedPath | None = None,
-        start: float = 0.0,
-        end: float | None = None,
-    ) -> None:
-        low, high = check_vector("min", min), check_vector("max", max)
-        if any(a >= b for a, b in zip(low, high, strict=True)):
-            raise ValueError(f"Expected `min` of the box to be below `max` on every axis, but got {low} and {high}.")
-        middle = tuple(0.5 * (a + b) for a, b in zip(low, high, strict=True))
-        super().__init__(middle, friction, gap, path, start, end)
-        half = [0.5 * (b - a) for a, b in zip(low, high, strict=True)]
-        angle = torch.deg2rad(torch.tensor(check_vector("turn", turn), dtype=torch.float64))
-        self.register_buffer("half_sides", torch.tensor(half, dtype=torch.float64))
-        self.register_buffer("axes", rotation_of(angle))
-        self.half_sides: Tensor
-        self.axes: Tensor
-
-    def in_frame(self, frame: SimFrame) -> Obstacle:
-        """The box in metres, z up."""
-        axes = frame.direction_to_sim(self.axes.T.contiguous()).T.contiguous()
-        return self.in_metres(frame, half_sides=self.half_sides * frame.metres_per_unit, axes=axes)
-
-    device_function = Obstacle.device_function
-
-    def solid(self) -> DeviceFunction:
-        numbers = Numbers(12, lambda: torch.cat([self.half_sides, self.axes.reshape(-1)]))
-        return DeviceFunction(box_distance, numbers=numbers, sources=(self,))
-
-
-class CapsuleObstacle(Obstacle):
-    """A rod with round ends that the material cannot enter: a pole, an arm. It turns about its middle.
-
-    Args:
-        first: One end of its axis, in scene units.
-        second: The other end.
-        radius: Its radius, in scene units.
-        friction: Coulomb coefficient.
-        gap: Distance that the material keeps from it [m].
-        path: Motion of the obstacle; None for one at rest.
-        start: Time from which it acts [s].
-        end: Time from which it no longer acts [s]; None for never.
-    """
-
-    def __init__(
-        self,
-        first: Sequence[float],
-        second: Sequence[float],
-        radius: float,
-        friction: float = 0.3,
-        gap: float = 0.0,
-        path: KeyedPath | None = None,
-        start: float = 0.0,
-        end: float | None = None,
-    ) -> None:
-        a, b = check_vector("first", first), check_vector("second", second)
-        middle = tuple(0.5 * (p + q) for p, q in zip(a, b, strict=True))
-        super().__init__(middle, friction, gap, path, start, end)
-        check_positive("radius", radius)
-        self.register_buffer("radius", torch.tensor(float(radius), dtype=torch.float64))
-        half = [0.5 * (q - p) for p, q in zip(a, b, strict=True)]
-        self.register_buffer("half_axis", torch.tensor(half, dtype=torch.float64))
-        self.radius: Tensor
-        self.half_axis: Tensor
-
-    def in_frame(self, frame: SimFrame) -> Obstacle:
-        """The rod in metres, z up."""
-        half = frame.direction_to_sim(self.half_axis) * frame.metres_per_unit
-        return self.in_metres(frame, radius=self.radius * frame.metres_per_unit, half_axis=half)
-
-    device_function = Obstacle.device_function
-
-    def solid(self) -> DeviceFunction:
-        def numbers() -> Tensor:
-            squared = self.half_axis.square().sum()
-            inverse = torch.where(squared > 0, 1 / squared, 0.0)
-            return torch.cat([self.radius[None], self.half_axis, inverse[None]])
-
-        return DeviceFunction(capsule_distance, numbers=Numbers(5, numbers), sources=(self,))
-
-
-class HalfSpaceObstacle(Obstacle):
-    """All space behind a plane: a floor, a wall. Unlike a ``Plane``, in ``total`` it is sharp, and it can move.
-
-    Args:
-        point: A point of the plane, in scene units; it turns about this point.
-        normal: Normal towards the free side, in scene axes.
-        friction: Coulomb coefficient.
-        gap: Distance that the material keeps from it [m].
-        path: Motion of the obstacle; None for one at rest.
-        start: Time from which it acts [s].
-        end: Time from which it no longer acts [s]; None for never.
-    """
-
-    def __init__(
-        self,
-        point: Sequence[float],
-        normal: Sequence[float],
-        friction: float = 0.3,
-        gap: float = 0.0,
-        path: KeyedPath | None = None,
-        start: float = 0.0,
-        end: float | None = None,
-    ) -> None:
-        super().__init__(check_vector("point", point), friction, gap, path, start, end)
-        n = torch.tensor(check_vector("normal", normal), dtype=torch.float64)
-        if float(n.norm()) == 0:
-            raise ValueError("Expected `normal` of the half space not to be zero.")
-        self.register_buffer("normal", n / n.norm())
-        self.normal: Tensor
-
-    def in_frame(self, frame: SimFrame) -> Obstacle:
-        """The half space in metres, z up."""
-        return self.in_metres(frame, normal=frame.direction_to_sim(self.normal).clone())
-
-    device_function = Obstacle.device_function
-
-    def solid(self) -> DeviceFunction:
-        return DeviceFunction(half_space_distance, numbers=Numbers(3, lambda: self.normal), sources=(self,))
-
-
-class MeshObstacle(Obstacle):
-    """A closed triangle mesh that the material cannot enter.
-
-    Its signed distance is computed on a grid once, so details smaller than a cell of that grid are rounded off. It
-    turns about the origin of the mesh.
-
-    Args:
-        mesh: A .ply or .obj file, in scene units and axes.
-        cells: Cells of the grid along the longest side of the mesh.
-        center: Position of the mesh's origin, in scene units.
-        friction: Coulomb coefficient.
-        gap: Distance that the material keeps from it [m].
-        path: Motion of the obstacle; None for one at rest.
-        start: Time from which it acts [s].
-        end: Time from which it no longer acts [s]; None for never.
-
-    Raises:
-        ValueError: If the file is no closed mesh.
-    """
-
-    def __init__(
-        self,
-        mesh: str,
-        cells: int = 48,
-        center: Sequence[float] = (0.0, 0.0, 0.0),
-        friction: float = 0.3,
-        gap: float = 0.0,
-        path: KeyedPath | None = None,
-        start: float = 0.0,
-        end: float | None = None,
-    ) -> None:
-        super().__init__(check_vector("center", center), friction, gap, path, start, end)
-        if cells < 4:
-            raise ValueError(f"Expected `cells` of the mesh to be at least 4, but got {cells}.")
-        self.mesh, self.cells = mesh, int(cells)
-        found = mesh_distance(*read_mesh(mesh), cells)
-        self.register_buffer("values", found.values)
-        self.register_buffer("corner", found.origin)
-        self.register_buffer("axes", torch.eye(3, dtype=torch.float64))
-        self.values: Tensor
-        self.corner: Tensor
-        self.axes: Tensor
-        self.spacing = found.spacing
-
-    def in_frame(self, frame: SimFrame) -> Obstacle:
-        """The mesh in metres, z up."""
-        unit = frame.metres_per_unit
-        axes = frame.direction_to_sim(torch.eye(3, dtype=torch.float64)).T.contiguous()
-        moved = self.in_metres(frame, values=self.values * unit, corner=self.corner * unit, axes=axes)
-        return changed(moved, spacing=self.spacing * unit)
-
-    device_function = Obstacle.device_function
-
-    def solid(self) -> DeviceFunction:
-        return grid_device_function(self, DistanceGrid(self.values, self.corner, self.spacing), self.axes)
-
-
-class StillGaussians(Obstacle):
-    """Everything in the scene that does not move: a curtain falls over a captured table.
-
-    Their surface is where the density of the Gaussians passes a level, on a grid around the object that a
-    ``Simulation`` makes once. Details smaller than a cell are rounded off.
-
-    Args:
-        cells: Cells of the grid along its longest side.
-        level: Density of the surface, from 0 to 1.
-        margin: Distance by which the grid reaches beyond the object at rest, in lengths of its longest side.
-        friction: Coulomb coefficient.
-        gap: Distance that the material keeps from it [m].
-        start: Time from which it acts [s].
-        end: Time from which it no longer acts [s]; None for never.
-    """
-
-    def __init__(
-        self,
-        cells: int = 96,
-        level: float = 0.5,
-        margin: float = 1.0,
-        friction: float = 0.3,
-        gap: float = 0.0,
-        start: float = 0.0,
-        end: float | None = None,
-    ) -> None:
-        super().__init__((0.0, 0.0, 0.0), friction, gap, None, start, end)
-        check_positive("margin", margin)
-        if not 0 < level < 1 or cells < 8:
-            raise ValueError(
-                f"Expected `level` between 0 and 1 and `cells` of at least 8, but got {level:g} and {cells}."
-            )
-        self.cells, self.level, self.margin, self.spacing = int(cells), float(level), float(margin), 0.0
-        self.register_buffer("values", torch.zeros(2, 2, 2, dtype=torch.float64), persistent=False)
-        self.register_buffer("corner", torch.zeros(3, dtype=torch.float64), persistent=False)
-        self.values: Tensor
-        self.corner: Tensor
-
-    def take(self, found: DistanceGrid) -> None:
-        """Set the grid of distances from the Gaussians, in metres, z up."""
-        assign(self, values=found.values, corner=found.origin, spacing=found.spacing)
-
-    def in_frame(self, frame: SimFrame) -> Obstacle:
-        """Itself: it is in metres."""
-        return copy.copy(self)
-
-    def solid(self) -> DeviceFunction:
-        """The interpolation of the grid; RuntimeError if none was set."""
-        if self.spacing == 0:
-            raise RuntimeError(
-                "The StillGaussians have no Gaussians: give them to a Simulation, which knows the scene."
-            )
-        return grid_device_function(
-            self, DistanceGrid(self.values, self.corner, self.spacing), torch.eye(3, device=self.corner.device)
-        )
-
-    def device_function(self) -> DeviceFunction | None:
-        return None if self.spacing == 0 else Obstacle.device_function(self)
 
 
 Solid = Plane | Obstacle

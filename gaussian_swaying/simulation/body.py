@@ -44,10 +44,10 @@ from gaussian_swaying.geometry.groups import equal_rows, joined, once, sums
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 from gaussian_swaying.geometry.origin import counted_from
 from gaussian_swaying.geometry.patches import deform_all
-from gaussian_swaying.geometry.regions import Everything, Region, whereabouts
+from gaussian_swaying.geometry.regions import Everything, Region, StillGaussians, whereabouts
 from gaussian_swaying.geometry.surface_normals import neighbour_normals
 from gaussian_swaying.mpm.boundary import Boundary
-from gaussian_swaying.mpm.colliders import Obstacle, StillGaussians
+from gaussian_swaying.mpm.colliders import Obstacle
 from gaussian_swaying.mpm.contact import Contact, Surface
 from gaussian_swaying.mpm.damping import decay_rate
 from gaussian_swaying.mpm.embedded import EmbeddedAtPoints, EmbeddedInGrid, EmbeddedPoints, on_material
@@ -1640,8 +1640,8 @@ class SimulatedScene(nn.Module):
             return
         self.surface_places = surface_of(body.samples, body.owner, self.points, self._dx, contact)
         for obstacle in obstacles:
-            if isinstance(obstacle, StillGaussians):
-                obstacle.take(self.still_distance(*self._box(obstacle.margin), obstacle.cells, obstacle.level))
+            if isinstance(shape := obstacle.shape, StillGaussians):
+                obstacle.take(self.still_distance(*self._box(shape.margin), shape.cells, shape.level))
 
     @torch.no_grad()
     def still_distance(self, low: Tensor, high: Tensor, cells: int, level: float = 0.5) -> DistanceGrid:

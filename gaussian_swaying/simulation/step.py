@@ -845,7 +845,7 @@ def _warn_falling(solver: Solver) -> None:
     if falls and all(isinstance(part, Impulse | RigidRegion) for part in solver.boundaries):
         warnings.warn(
             "Nothing holds the object and nothing lies below it, so it falls: add a pin to `solver.boundaries` (in "
-            "Python `hold`, which may be auto), or a HalfSpaceObstacle as the ground, or set `solver.gravity` to "
+            "Python `hold`, which may be auto), or an Obstacle as the ground, or set `solver.gravity` to "
             "[0, 0, 0].",
             UserWarning,
             stacklevel=3,

@@ -93,6 +93,7 @@ def box(low, high):
     return named("Box", min=[low, None, None], max=[high, None, None])
 
 
+WALL = named("HalfSpace", point=[0.0, 0.05, 0.0], normal=[0.0, -1.0, 0.0])
 HELD = Part("pole", "held")
 SOFT = {"E": 2e4, "nu": 0.3, "density": 40.0, "thickness": 0.01}
 SMALLER = {
@@ -201,7 +202,7 @@ CASES = {
                 named("PinnedRegion", region=box(None, 0.1), kind="clamp"),
                 named("Handle", region=box(1.1, None), velocity=[0.1, 0.3, 0.0]),
                 named("Impulse", region=box(0.4, 0.6), impulse=[0.0, -0.05, 0.0]),
-                named("HalfSpaceObstacle", point=[0.0, 0.05, 0.0], normal=[0.0, -1.0, 0.0], friction=0.4),
+                named("Obstacle", shape=WALL, friction=0.4),
             ],
         },
     ),

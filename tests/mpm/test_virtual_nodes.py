@@ -19,7 +19,8 @@ from gaussian_swaying import (
     WindForce,
 )
 from gaussian_swaying.geometry.linalg import polar_rotation
-from gaussian_swaying.mpm.colliders import BallObstacle, Plane, VelocityBox
+from gaussian_swaying.geometry.regions import Sphere
+from gaussian_swaying.mpm.colliders import Obstacle, Plane, VelocityBox
 from gaussian_swaying.mpm.contact import Surface
 from gaussian_swaying.mpm.embedded import EmbeddedInGrid, on_material
 from gaussian_swaying.mpm.pins import Handle, RigidRegion
@@ -319,7 +320,7 @@ def test_contact_and_obstacles_in_kernels():
     up[:, 2] = 1.0
     velocity = -2.0 * (number == 2)[:, None] * up
     surface = Surface.of_points(points, up, 0.5, 0.2, Contact())
-    solver = MPMSolver(1.0, gravity=(0, 0, -1), boundaries=[BallObstacle([2.0, 2.0, 2.3], 0.7)])
+    solver = MPMSolver(1.0, gravity=(0, 0, -1), boundaries=[Obstacle(Sphere([2.0, 2.0, 2.3], 0.7))])
     start = solver.init_state(points, velocity, surface=surface)
     assert start.grid.virtual > 0
     end = solver.rollout(start, 0.5 * solver.stable_substep(start), 60)

@@ -9,8 +9,8 @@ from shared import double, peak, unit, value_error
 from small_scenes import together
 
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
-from gaussian_swaying.geometry.regions import Box
-from gaussian_swaying.mpm.colliders import BallObstacle, StillGaussians
+from gaussian_swaying.geometry.regions import Box, Sphere, StillGaussians
+from gaussian_swaying.mpm.colliders import Obstacle
 from gaussian_swaying.mpm.contact import Contact
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes import DemoScene, FlagScene, GivenScene
@@ -25,7 +25,7 @@ def _ball(contact=None, boundaries=None, **more):
         region=Box([None, None, 0.67], [None, None, 0.69]),
         metres_per_unit=1.0,
     )
-    given = [BallObstacle([0, 0, 0.35], 0.3)] if boundaries is None else boundaries
+    given = [Obstacle(Sphere([0, 0, 0.35], 0.3))] if boundaries is None else boundaries
     solver = MPMSolver(0.06, boundaries=given, **more)
     return Simulation(
         scene, Material(E=5e3, density=50.0, thickness=0.02), solver=solver, contact=contact, device="cpu"
@@ -49,7 +49,7 @@ def test_a_cloth_falls_onto_a_ball_and_stays_outside():
 
 def test_gaussians_that_stand_still_are_an_obstacle():
     """The ball of the splat stops the cloth as the exact one does, to the width of a cell of the distance grid."""
-    _, away = _fallen(_ball(boundaries=[StillGaussians(cells=48, margin=0.5)]), 8)
+    _, away = _fallen(_ball(boundaries=[Obstacle(StillGaussians(cells=48, margin=0.5))]), 8)
     cell = 1.2 / 48
     assert -0.5 * cell < away.min() - 0.01 < 1.5 * cell
 
@@ -96,8 +96,10 @@ contact: {thickness: 0.007, friction: 0.1}
 solver:
   dx: 0.1
   boundaries:
-    - class_path: BallObstacle
-      init_args: {center: [0, 0, 0.35], radius: 0.3, path: {times: [0, 1], moves: [[0, 0, 0], [0, 0, 1]]}}
+    - class_path: Obstacle
+      init_args:
+        shape: {class_path: Sphere, init_args: {center: [0, 0, 0.35], radius: 0.3}}
+        path: {times: [0, 1], moves: [[0, 0, 0], [0, 0, 1]]}
 """
     file = tmp_path / "cloth.yaml"
     file.write_text(text)

@@ -31,7 +31,8 @@ from gaussian_swaying import (
 )
 from gaussian_swaying.config.parser import CUSTOM, PYTHON_ONLY, arguments_of
 from gaussian_swaying.gaussians.parts import Part, Parts
-from gaussian_swaying.mpm.colliders import HalfSpaceObstacle
+from gaussian_swaying.geometry.regions import HalfSpace
+from gaussian_swaying.mpm.colliders import Obstacle
 from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.mpm.pins import Impulse
 from gaussian_swaying.scenes import FlagScene
@@ -345,7 +346,7 @@ FALLS = "Nothing holds the object"
         ({}, -9.8, 1),
         ({"solver": MPMSolver(0.2, boundaries=[Impulse(POLE, [0.0, 0.0, 1.0])])}, -9.8, 1),
         ({"solver": MPMSolver(0.2, gravity=[0.0, 0.0, 0.0])}, 0.0, 0),
-        ({"solver": MPMSolver(0.2, boundaries=[HalfSpaceObstacle([0.0] * 3, [0.0, 0.0, 1.0])])}, -9.8, 0),
+        ({"solver": MPMSolver(0.2, boundaries=[Obstacle(HalfSpace([0.0] * 3, [0.0, 0.0, 1.0]))])}, -9.8, 0),
     ],
 )
 def test_gravity_of_what_is_held_and_of_what_falls(given, down, told):

@@ -14,15 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gaussian_swaying.geometry.regions import Box, Capsule, HalfSpace, Sphere
 from gaussian_swaying.mpm.boundary import Boundary
-from gaussian_swaying.mpm.colliders import (
-    BallObstacle,
-    BoxObstacle,
-    CapsuleObstacle,
-    HalfSpaceObstacle,
-    Obstacle,
-    Plane,
-)
+from gaussian_swaying.mpm.colliders import Obstacle, Plane
 from gaussian_swaying.mpm.laws.elastic import FixedCorotated, NeoHookean, SpringNetwork, StVKHencky
 from gaussian_swaying.mpm.modes import Modes
 from gaussian_swaying.mpm.pins import PinnedPoints, PinnedRegion
@@ -40,8 +34,8 @@ from gaussian_swaying.wind.turbulence import Turbulence
 LAWS = (FixedCorotated, NeoHookean, StVKHencky, SpringNetwork)
 """The laws that a browser knows, by their number in the block."""
 
-OBSTACLES = (HalfSpaceObstacle, BallObstacle, CapsuleObstacle, BoxObstacle)
-"""The obstacles that a browser knows, as long as they stand still."""
+OBSTACLES = {HalfSpace: "half_space", Sphere: "capsule", Capsule: "capsule", Box: "box"}
+"""The shapes of obstacles that a browser knows, as long as they stand still."""
 
 
 def check(simulation: Simulation) -> None:
@@ -106,12 +100,14 @@ def in_webassembly(simulation: Simulation) -> bool:
 
 def _check_boundary(boundary: Any) -> None:
     name = type(boundary).__name__
-    if isinstance(boundary, OBSTACLES):
+    if isinstance(boundary, Obstacle):
+        name = type(boundary.shape).__name__
+        if type(boundary.shape) in OBSTACLES and boundary.still:
+            return
         if not boundary.still:
             raise _refused(f"the `path` of the {name}", "leave it out")
-        return
     if type(boundary) not in (PinnedRegion, PinnedPoints, Plane):
-        known = ", ".join(one.__name__ for one in (PinnedRegion, PinnedPoints, Plane, *OBSTACLES))
+        known = ", ".join(one.__name__ for one in (PinnedRegion, PinnedPoints, Plane, Obstacle, *OBSTACLES))
         raise _refused(f"the {name} in `solver.boundaries`", f"take one of {known}")
     if type(boundary) is not Plane and not boundary.always:
         raise _refused(f"`start` and `end` of the {name}", "leave them out")
@@ -266,15 +262,10 @@ def _plane(plane: Boundary) -> dict[str, Any]:
 
 
 def _obstacle(obstacle: Obstacle) -> dict[str, Any]:
-    if isinstance(obstacle, HalfSpaceObstacle):
-        kind, numbers = "half_space", obstacle.normal
-    elif isinstance(obstacle, BoxObstacle):
-        kind, numbers = "box", torch.cat([obstacle.half_sides, obstacle.axes.reshape(-1)])
-    elif isinstance(obstacle, CapsuleObstacle):
-        kind, numbers = "capsule", torch.cat([obstacle.radius[None], obstacle.half_axis])
-    else:
-        assert isinstance(obstacle, BallObstacle)
-        kind, numbers = "capsule", torch.nn.functional.pad(obstacle.radius[None], (0, 3))
+    kind = OBSTACLES[type(obstacle.shape)]
+    numbers = obstacle.numbers[:4] if kind == "capsule" else obstacle.numbers
+    if len(numbers) == 1:
+        numbers = torch.nn.functional.pad(numbers, (0, 3))
     return {
         "kind": kind,
         "center": obstacle.center.tolist(),

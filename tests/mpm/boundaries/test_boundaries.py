@@ -269,12 +269,9 @@ REFUSED = [
     ("Impulse", (BALL, [1, 0, 0]), {"end": math.inf}, "end"),
     ("Impulse", (BALL, [1, 0]), {}, "impulse"),
     ("Impulse", (BALL, [1, 0, 0]), {"start": 1.0}, "end"),
-    ("BallObstacle", (ZERO, 0.0), {}, "radius"),
-    ("BallObstacle", (ZERO, 1.0), {"friction": -1.0}, "friction"),
-    ("BallObstacle", (ZERO, 1.0), {"gap": -1.0}, "gap"),
-    ("CapsuleObstacle", (ZERO, UNIT, -1.0), {}, "radius"),
-    ("BoxObstacle", (ZERO, [0, 1, 1]), {}, "min"),
-    ("HalfSpaceObstacle", (ZERO, ZERO), {}, "normal"),
+    ("Obstacle", (BALL,), {"friction": -1.0}, "friction"),
+    ("Obstacle", (BALL,), {"gap": -1.0}, "gap"),
+    ("Obstacle", (Box([0, 0, None], [1, 1, 1]),), {}, "max"),
 ]
 
 
@@ -300,7 +297,7 @@ def test_pin_holds_only_its_end(formulation):
 @pytest.mark.parametrize(("time", "acts"), [(0.4, False), (0.5, True), (0.9, True), (1.0, False)])
 def test_an_obstacle_stops_the_nodes_on_and_in_it_in_its_time(time, acts):
     """A ball of radius 2 without friction: what moves into it slides, from its surface inwards."""
-    ball = BOUNDARIES["BallObstacle"]([1.0, 0.0, 0.0], 2.0, friction=0.0, start=0.5, end=1.0)
+    ball = BOUNDARIES["Obstacle"](Sphere([1.0, 0.0, 0.0], 2.0), friction=0.0, start=0.5, end=1.0)
     place = double([[3.0, 0, 0], [2.0, 0, 0], [3.001, 0, 0], [-4.0, 0, 0]])
     velocity = double([[-1.0, 0.5, 0.0]]).expand(4, 3)
     found = ball(velocity, Nodes(double(time), 1e-3, place))
@@ -315,14 +312,15 @@ def test_a_mesh_in_a_frame_is_as_far_as_in_the_scene(path):
     turn = double([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     frame = SimFrame(double([0.3, -0.1, 0.2]), turn, 3.0)
     mesh = OBSTACLES["mesh"](path=path)
-    low, high = mesh.corner, mesh.corner + mesh.spacing * (torch.tensor(mesh.values.shape) - 1)
+    grid = mesh.shape.grid
+    low, high = grid.origin, grid.origin + grid.spacing * (torch.tensor(grid.values.shape) - 1)
     draw = rand(200, 3, generator=seeded(0))
     place = low + draw * (high - low) + torch.tensor([0.113, 0.207, 0.181])
     now = double(0.0)
     distance, normal, speed = mesh.touch(place, now, 0.1)
     found = mesh.in_frame(frame).touch(frame.point_to_sim(place), now, 0.1)
-    assert distance.amin() < -2 * mesh.spacing
-    assert distance.amax() > 2 * mesh.spacing
+    assert distance.amin() < -2 * grid.spacing
+    assert distance.amax() > 2 * grid.spacing
     assert_close(found[0], 3 * distance)
     assert_close(found[1], normal @ turn.T)
     assert_close(found[2], 3 * speed @ turn.T)

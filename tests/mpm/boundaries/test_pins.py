@@ -29,9 +29,9 @@ from torch.testing import assert_close
 
 from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedPoints, PinnedRegion, SimFrame, support_force
 from gaussian_swaying.geometry.keyed_path import KeyedPath
-from gaussian_swaying.geometry.regions import Everything
+from gaussian_swaying.geometry.regions import Everything, Sphere
 from gaussian_swaying.mpm import pins as pinning
-from gaussian_swaying.mpm.colliders import BallObstacle, Plane
+from gaussian_swaying.mpm.colliders import Obstacle, Plane
 from gaussian_swaying.mpm.pins import (
     MOST_ROWS,
     SOFTENED,
@@ -397,7 +397,7 @@ def test_the_longest_proven_substep_stays_stable(kind, hundreds):
 def test_supports_take_the_momentum_of_the_forces(formulation):
     """In every substep: momentum gained = gravity - what the boundaries took."""
     points = _sheet()
-    ball = BallObstacle([0.2, 0.05, -0.3], 0.1, path=KeyedPath([0.0, 1.0], [[0, 0, 0], [0.1, -2.0, 0.3]]))
+    ball = Obstacle(Sphere([0.2, 0.05, -0.3], 0.1), path=KeyedPath([0.0, 1.0], [[0, 0, 0], [0.1, -2.0, 0.3]]))
     pins = [PinnedRegion(TOP), Plane([0, 0, -0.41], [0, 0, 1], "separate", 0.3), ball]
     solver = MPMSolver(DX, formulation, boundaries=pins)
     states = _run(solver, points, 60, 1e-3)

@@ -10,8 +10,8 @@ from shared import ZERO, beyond, double, in_both, longest, near, peak, solid, up
 from torch.testing import assert_close
 
 from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedPoints, PinnedRegion
-from gaussian_swaying.geometry.regions import Everything, Union
-from gaussian_swaying.mpm.colliders import HalfSpaceObstacle
+from gaussian_swaying.geometry.regions import Everything, HalfSpace, Union
+from gaussian_swaying.mpm.colliders import Obstacle
 from gaussian_swaying.mpm.pins import Handle, RigidRegion
 
 RIGHT = beyond(x=0.2)
@@ -222,7 +222,7 @@ def test_what_cannot_be_is_refused():
 
 
 def test_in_total_a_part_falls_on_the_ground_and_rests_there():
-    ground = HalfSpaceObstacle([0.0, 0.0, -0.03], [0.0, 0.0, 1.0], 0.5)
+    ground = Obstacle(HalfSpace([0.0, 0.0, -0.03], [0.0, 0.0, 1.0]), 0.5)
     points, solver = bar(ground, RigidRegion(Everything()))
     state = advance(solver, solver.init_state(points), 0.4)
     before = state.position

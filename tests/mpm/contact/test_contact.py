@@ -8,7 +8,8 @@ from contacts import crossings, gaps, sheet_triangles
 from shared import ZERO, longest, near, peak, value_error
 
 from gaussian_swaying import Contact, MaterialPoints, MPMSolver, PinnedPoints
-from gaussian_swaying.mpm.colliders import HalfSpaceObstacle
+from gaussian_swaying.geometry.regions import HalfSpace
+from gaussian_swaying.mpm.colliders import Obstacle
 from gaussian_swaying.mpm.contact import Surface
 
 from .bodies import layers, march, scene, sheet
@@ -66,7 +67,7 @@ def test_a_strip_that_falls_folds_and_does_not_cross_itself(seconds):
     solver, state = scene(
         points,
         Contact(),
-        [HalfSpaceObstacle(*GROUND)],
+        [Obstacle(HalfSpace(*GROUND))],
         velocity=torch.stack([torch.sin(9 * points.position[:, 2]), 0 * points.mass, 0 * points.mass], -1) * 0.3,
         normal=(1.0, 0.0, 0.0),
         stiffness_damping=1e-3,
@@ -83,7 +84,7 @@ def test_a_strip_that_falls_folds_and_does_not_cross_itself(seconds):
 @pytest.mark.parametrize("count", [8, *(pytest.param(n, marks=pytest.mark.slow) for n in (15, 50))])
 def test_layers_pressed_together_stay_in_order(count):
     """They fall on each other with twice the weight; every layer stays above the one below it, everywhere."""
-    ground = [HalfSpaceObstacle(*GROUND)]
+    ground = [Obstacle(HalfSpace(*GROUND))]
     solver, state = layers(count, 1.1 * THICKNESS, shift=0.003, boundaries=ground, gravity=(0, 0, -20.0))
     for later in march(solver, state, 0.15, frame=0.03):
         height = later.position[:, 2].reshape(count, -1)
@@ -93,7 +94,7 @@ def test_layers_pressed_together_stay_in_order(count):
 
 def _rest(count, seconds, dtype=torch.float64):
     """Changes of the energy and of its elastic part after a pile has settled; how far a layer rises or sinks."""
-    settings = {"gravity": (0, 0, -9.8), "stiffness_damping": 1e-3, "boundaries": [HalfSpaceObstacle(*GROUND)]}
+    settings = {"gravity": (0, 0, -9.8), "stiffness_damping": 1e-3, "boundaries": [Obstacle(HalfSpace(*GROUND))]}
     solver, state = layers(count, THICKNESS, side=5, shift=0.003, dtype=dtype, **settings)
     settled = march(solver, state, 0.5, frame=0.1)[-1]
     later = march(solver, settled, seconds, frame=0.1)

@@ -7,9 +7,10 @@ from shared import ZERO, double, peak, value_error
 from torch.testing import assert_close
 
 from gaussian_swaying import Contact, MaterialPoints, PinnedPoints
+from gaussian_swaying.geometry.regions import HalfSpace, Sphere
 from gaussian_swaying.kernels.derive import on_tensors
 from gaussian_swaying.mpm import contact, contact_kernels
-from gaussian_swaying.mpm.colliders import BallObstacle, HalfSpaceObstacle
+from gaussian_swaying.mpm.colliders import Obstacle
 
 from .bodies import scene, sheet
 
@@ -44,9 +45,9 @@ def _collision(device, dtype=torch.float32):
     velocity[below.count :] = torch.tensor([6.0, 0.0, -20.0]).to(velocity)
     pins = PinnedPoints([[0.0, 0.0, 0.0], [0.08, 0.0, 0.0]])
     balls = [
-        BallObstacle([0.04, 0.04, -0.06], 0.05, 0.4),
-        BallObstacle([0.04, 0.04, -0.5], 0.05),  # out of reach
-        BallObstacle([0.0, 0.08, -0.045], 0.05, start=3.5 * DT, end=4.5 * DT),
+        Obstacle(Sphere([0.04, 0.04, -0.06], 0.05), 0.4),
+        Obstacle(Sphere([0.04, 0.04, -0.5], 0.05)),  # out of reach
+        Obstacle(Sphere([0.0, 0.08, -0.045], 0.05), start=3.5 * DT, end=4.5 * DT),
     ]
     return points, velocity, [pins, *balls]
 
@@ -89,7 +90,7 @@ def test_a_collision_is_the_same_in_float32_and_float64(device, iterations):
 def test_iterations_are_counted_where_there_are_obstacles(device):
     """One in every substep of a sheet that presses on the ground."""
     points = sheet(5, 5, dtype=torch.float32).map(lambda t: t.to(device))
-    ground = HalfSpaceObstacle([0.0, 0.0, -0.004], [0.0, 0.0, 1.0])
+    ground = Obstacle(HalfSpace([0.0, 0.0, -0.004], [0.0, 0.0, 1.0]))
     solver, state = scene(points, Contact(iterations=1), [ground], transfer="kernels", gravity=(0.0, 0.0, -9.8))
     solver.rollout(state, DT, 6)
     assert solver.kernels.touching.rounds == 6

@@ -8,7 +8,8 @@ from shared import ZERO, double, in_both, longest, near, solid, value_error
 
 from gaussian_swaying import MPMSolver
 from gaussian_swaying.geometry.keyed_path import KeyedPath
-from gaussian_swaying.mpm.colliders import BallObstacle, BoxObstacle, CapsuleObstacle, HalfSpaceObstacle
+from gaussian_swaying.geometry.regions import Box, Capsule, HalfSpace, Sphere
+from gaussian_swaying.mpm.colliders import Obstacle
 
 from .bodies import march, scene, sheet
 
@@ -44,7 +45,7 @@ def test_a_block_slides_beyond_the_angle_of_friction(formulation, friction, degr
     """
     angle = math.atan(friction) + math.radians(degrees)
     gravity = (9.8 * math.sin(angle), 0.0, -9.8 * math.cos(angle))
-    ground = HalfSpaceObstacle([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], friction)
+    ground = Obstacle(HalfSpace([0.0, 0.0, 0.0], [0.0, 0.0, 1.0]), friction)
     solver = MPMSolver(0.1, formulation, gravity=gravity, stiffness_damping=2e-3, boundaries=[ground])
     settled = _roll(solver, solver.init_state(_block()), 10)
     end = _roll(solver, settled, 8)
@@ -64,9 +65,9 @@ def test_a_moving_obstacle_moves_what_lies_on_it(formulation, shape):
     keys = [[0.0, 0.0, 0.0], [0.1, 0.0, 0.05], [0.5, 0.0, 0.25]]
     path = KeyedPath([0.0, 0.4, 1.2], keys)
     obstacle = {
-        "ground": lambda: HalfSpaceObstacle([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], 2.0, path=path),
-        "block": lambda: BoxObstacle([-0.6, -0.6, -0.3], [0.6, 0.6, 0.0], friction=2.0, path=path),
-        "capsule": lambda: CapsuleObstacle([-9.0, 0.0, -4.0], [9.0, 0.0, -4.0], 4.0, 2.0, path=path),
+        "ground": lambda: Obstacle(HalfSpace([0.0, 0.0, 0.0], [0.0, 0.0, 1.0]), 2.0, path=path),
+        "block": lambda: Obstacle(Box([-0.6, -0.6, -0.3], [0.6, 0.6, 0.0]), friction=2.0, path=path),
+        "capsule": lambda: Obstacle(Capsule([-9.0, 0.0, -4.0], [9.0, 0.0, -4.0], 4.0), 2.0, path=path),
     }[shape]()
     solver = MPMSolver(0.1, formulation, stiffness_damping=2e-3, boundaries=[obstacle])
     state = _roll(solver, solver.init_state(_block()), 22)
@@ -76,7 +77,7 @@ def test_a_moving_obstacle_moves_what_lies_on_it(formulation, shape):
 @pytest.mark.parametrize("frames", [8, pytest.param(20, marks=pytest.mark.slow)])
 def test_a_block_that_rests_stays_where_it_is(frames):
     """In `total` the lowest points lie on the ground within the overlap that carries their weight, of order g dt²."""
-    ground = HalfSpaceObstacle([0.0, 0.0, 0.0], [0.0, 0.0, 1.0])
+    ground = Obstacle(HalfSpace([0.0, 0.0, 0.0], [0.0, 0.0, 1.0]))
     solver = MPMSolver(0.1, stiffness_damping=5e-3, boundaries=[ground])
     state = _roll(solver, solver.init_state(_block(bottom=0.005)), frames)
     lowest = state.position[:, 2].min()
@@ -89,7 +90,7 @@ def test_a_fast_sheet_does_not_pass_a_thin_rod():
     """50 m/s onto a rod of 4 cm: three times its width in a frame."""
     points = sheet(16, 16)
     velocity = double([0.0, 0.0, -50.0]).expand(points.count, 3)
-    rod = CapsuleObstacle([0.15, -1.0, -0.05], [0.15, 2.0, -0.05], 0.02)
+    rod = Obstacle(Capsule([0.15, -1.0, -0.05], [0.15, 2.0, -0.05], 0.02))
     solver, state = scene(points, boundaries=[rod], velocity=velocity, gravity=ZERO)
     below = double([0.15, 0.0, -0.05])
     for later in march(solver, state, 0.01, frame=0.001):
@@ -101,7 +102,7 @@ def test_a_fast_sheet_does_not_pass_a_thin_rod():
 def _flying_ball(speed=1e4, turns=(), **settings):
     """A ball that crosses a free sheet within one frame of 4e-5 s, in ``updated``; it was still before."""
     times, moves = [0.0, 1.0, 1.0 + 0.4 / speed], [[0, 0, -0.2], [0, 0, -0.2], [0, 0, 0.2]]
-    ball = BallObstacle([0.1, 0.1, 0.0], 0.18, friction=0.0, path=KeyedPath(times, moves, list(turns)))
+    ball = Obstacle(Sphere([0.1, 0.1, 0.0], 0.18), friction=0.0, path=KeyedPath(times, moves, list(turns)))
     points = sheet(11, 11)
     solver = MPMSolver(0.044, "updated", gravity=ZERO, boundaries=[ball], **settings)
     state = solver.init_state(points)

@@ -15,7 +15,7 @@ from shared import ZERO, in_both, normalized, peak, seeded
 from gaussian_swaying import AeroForce, WindField, WindForce
 from gaussian_swaying._fixed import changed
 from gaussian_swaying.geometry.keyed_path import KeyedPath
-from gaussian_swaying.geometry.regions import Everything
+from gaussian_swaying.geometry.regions import Box, Capsule, Everything, Mesh, Sphere
 from gaussian_swaying.kernels.launch import lanes
 from gaussian_swaying.mpm import total
 from gaussian_swaying.mpm.state import GridSpec
@@ -109,13 +109,13 @@ POINT_HOLDS = {  # for `total` alone
 OTHERS = {  # obstacles for `updated` alone, where they stop nodes; wind on a rigid part differs
     "rigid part": lambda: [made("RigidRegion", TOP)(), NODES()],
     "obstacles": lambda: [
-        made("BallObstacle", [0.1, 0.1, 0.05], 0.06, 0.4)(),
+        made("Obstacle", Sphere([0.1, 0.1, 0.05], 0.06), 0.4)(),
         SLOPE(kind="separate", friction=0.2, end=1.5 * DT),
-        made("BoxObstacle", [0.2, 0.05, 0.05], [0.3, 0.25, 0.15], [0.0, 0.0, 20.0], 0.3)(),
+        made("Obstacle", Box([0.2, 0.05, 0.05], [0.3, 0.25, 0.15]), rotation=[0.0, 0.0, 20.0], friction=0.3)(),
     ],
     "moving obstacles": lambda: [
-        made("CapsuleObstacle", [0.05, 0.05, 0.1], [0.1, 0.2, 0.1], 0.05, path=PATH, start=0.5 * DT)(),
-        made("MeshObstacle", MESH, 8, [0.25, 0.25, 0.1], 0.5, path=PATH)(),
+        made("Obstacle", Capsule([0.05, 0.05, 0.1], [0.1, 0.2, 0.1], 0.05), path=PATH, start=0.5 * DT)(),
+        made("Obstacle", Mesh(MESH, 8, [0.25, 0.25, 0.1]), 0.5, path=PATH)(),
     ],
 }
 SEMI = {"drag_step": "semi_implicit"}
@@ -233,7 +233,7 @@ def test_kernels_do_what_torch_does(kernel_device, scene):
 
 
 def test_an_obstacle_of_a_user_runs_in_torch(kernel_device):
-    class Bumpy(KINDS["BallObstacle"]):
+    class Bumpy(KINDS["Obstacle"]):
         def distance(self, place):
             distance, normal = super().distance(place)
             return distance - 0.01 * torch.sin(40 * place[..., 0]), normal
@@ -243,7 +243,7 @@ def test_an_obstacle_of_a_user_runs_in_torch(kernel_device):
         return solver.rollout(state, DT, 3)
 
     points = make_points(kernel_device, count=12)
-    ends = run_both(points, run, boundaries=[Bumpy([0.1, 0.1, 0.05], 0.06)])
+    ends = run_both(points, run, boundaries=[Bumpy(Sphere([0.1, 0.1, 0.05], 0.06))])
     check_agreement(ends)
     assert peak(ends[1].impulse) > 1e-4
 

@@ -20,8 +20,9 @@ from gaussian_swaying import (
     WindField,
 )
 from gaussian_swaying._fixed import assign
+from gaussian_swaying.geometry.regions import Sphere
 from gaussian_swaying.mpm import run, total, updated
-from gaussian_swaying.mpm.colliders import BallObstacle, EnclosingBox, Plane, VelocityBox
+from gaussian_swaying.mpm.colliders import EnclosingBox, Obstacle, Plane, VelocityBox
 from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.mpm.pins import Handle
 from gaussian_swaying.mpm.state import GridSpec
@@ -348,7 +349,7 @@ def test_a_fresh_solver_goes_on_to_the_same_bits():
 BEHIND = PinnedRegion(up_to(x=0.12), "clamp")
 CASES = {
     "total": lambda: {"boundaries": [BEHIND]},
-    "total with an obstacle": lambda: {"boundaries": [BEHIND, BallObstacle([0.5, 0.5, 0.1], 0.2, 0.4)]},
+    "total with an obstacle": lambda: {"boundaries": [BEHIND, Obstacle(Sphere([0.5, 0.5, 0.1], 0.2), 0.4)]},
     "updated": lambda: {"boundaries": [Plane([0.0, 0.0, 0.1], [0.1, 0.0, 1.0], "separate", 0.3)]},
     "sand": lambda: {"boundaries": [PinnedRegion(up_to(x=0.12), "nodes")]},
 }

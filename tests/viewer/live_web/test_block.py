@@ -103,19 +103,19 @@ def test_laws_forces_and_boundaries(make, in_node, name):
         assert told[0]["lanes"] is not plain
 
 
-def obstacle(name, **options):
-    return {"class_path": name, "init_args": options}
+def obstacle(shape, gap=0.0, start=0.0, **options):
+    more = {"gap": gap, "start": start, "rotation": options.pop("rotation", [0.0] * 3)}
+    made = {"class_path": shape, "init_args": options}
+    return {"class_path": "Obstacle", "init_args": {"shape": made, "friction": 0.4, **more}}
 
 
 OBSTACLES = {
     "ground and ball": [
-        obstacle("HalfSpaceObstacle", point=[0, 0, -0.1], normal=[0, 0.1, 1], friction=0.4),
-        obstacle("BallObstacle", center=[0.25, 0.15, 0.1], radius=0.1, gap=0.005),
+        obstacle("HalfSpace", point=[0, 0, -0.1], normal=[0, 0.1, 1]),
+        obstacle("Sphere", center=[0.25, 0.15, 0.1], radius=0.1, gap=0.005),
     ],
-    "box": [obstacle("BoxObstacle", min=[0.2, 0.05, -0.2], max=[0.5, 0.2, 0.1], turn=[0.0, 0.0, 20.0])],
-    "rod, later": [
-        obstacle("CapsuleObstacle", first=[0.25, -0.3, 0.0], second=[0.25, 0.4, 0.05], radius=0.04, start=0.1)
-    ],
+    "box": [obstacle("Box", min=[0.2, 0.05, -0.2], max=[0.5, 0.2, 0.1], rotation=[0.0, 0.0, 20.0])],
+    "rod, later": [obstacle("Capsule", first=[0.25, -0.3, 0.0], second=[0.25, 0.4, 0.05], radius=0.04, start=0.1)],
 }
 
 
@@ -221,6 +221,7 @@ class Lift(Force):
         return state.velocity
 
 
+BALL = {"class_path": "Sphere", "init_args": {"center": [0.4, 0.4, 0.0], "radius": 0.1}}
 REFUSED = {
     "solver.formulation": {"solver": {"formulation": "updated"}},
     "contact": {"contact": {"thickness": 0.01}},
@@ -228,10 +229,9 @@ REFUSED = {
         "solver": {
             "boundaries": [
                 {
-                    "class_path": "BallObstacle",
+                    "class_path": "Obstacle",
                     "init_args": {
-                        "center": [0.4, 0.4, 0.0],
-                        "radius": 0.1,
+                        "shape": BALL,
                         "path": {"times": [0, 1], "moves": [[0, 0, 0], [0, 1, 0]]},
                     },
                 }
