@@ -20,6 +20,10 @@ GONE = {
     **{f"{name}Scene": f"DemoScene with `kind: {kind}` and `count`" for name, kind in _KINDS.items()},
     "ClothScene": "DemoScene with `kind` cloth_over_ball, cloth_over_table, ball_on_cloth or two_flags, and `size`",
     **{f"{name}Obstacle": f"Obstacle with `shape: {name}`" for name in ("Box", "Capsule", "HalfSpace", "Mesh")},
+    "LogProfile": "Profile",
+    "PowerProfile": "Profile with an `exponent`",
+    "CylinderObstacle": "Obstacle with a null among its `radii`",
+    "EllipsoidObstacle": "Obstacle",
     "BallObstacle": "Obstacle with `shape: Sphere`",
     "FlagOnStandScene": "FlagScene with `stand: pole`",
 }

@@ -28,7 +28,6 @@ from gaussian_swaying.config.gone import refuse_gone
 from gaussian_swaying.config.material_names import NAMES, with_material_option, with_named_materials
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.rendering.cameras.keyframes import KeyframedCamera
-from gaussian_swaying.wind.effects import CylinderObstacle, EllipsoidObstacle
 from gaussian_swaying.wind.field import SpatialWind
 from gaussian_swaying.wind.tables import FrozenWind, Shelter
 from gaussian_swaying.wind.turbulence import Turbulence
@@ -38,7 +37,7 @@ if TYPE_CHECKING:
 
 # imported so that a configuration can use their class names without the module
 CAMERA_PATHS = (CaptureCamera, KeyframedCamera)
-EFFECTS = (CylinderObstacle, EllipsoidObstacle, FrozenWind, Shelter, Turbulence)
+EFFECTS = (FrozenWind, Shelter, Turbulence)
 # options that a configuration file cannot contain; settings that may change when a run is resumed
 COMMAND_LINE_ONLY = ("preset",)
 RUN_ONLY = ("config", "output", "device", "frames", "resume", "slow", "loop")

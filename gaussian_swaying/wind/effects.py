@@ -20,6 +20,7 @@ from gaussian_swaying._fixed import changed
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.linalg import vectors
 from gaussian_swaying.geometry.linalg_triton import add3, chosen, cross3, dot3, matvec, scale3, transpose, where3
+from gaussian_swaying.geometry.rotations import rotation_of
 from gaussian_swaying.kernels.derive import Memory, on_tensors
 from gaussian_swaying.kernels.graphs import Component
 from gaussian_swaying.kernels.language import tl, triton
@@ -31,7 +32,7 @@ SPREAD = 58.0
 
 @triton.jit
 def log_profile(v, x, numbers, now, table, OPTIONS: tl.constexpr):
-    """``LogProfile``; ``numbers``: height of the ground, roughness, one over the logarithm."""
+    """``Profile``; ``numbers``: height of the ground, roughness, one over the logarithm."""
     above = tl.maximum(x[2] - numbers[0], numbers[1])
     factor = tl.log(above / numbers[1]) * numbers[2]
     return scale3(factor, v)
@@ -39,7 +40,7 @@ def log_profile(v, x, numbers, now, table, OPTIONS: tl.constexpr):
 
 @triton.jit
 def power_profile(v, x, numbers, now, table, OPTIONS: tl.constexpr):
-    """``PowerProfile``; ``numbers``: height of the ground, one over the height, exponent."""
+    """``Profile`` with an exponent; ``numbers``: height of the ground, one over the height, exponent."""
     above = (x[2] - numbers[0]) * numbers[1]
     factor = tl.exp(numbers[2] * tl.log(tl.where(above > 0, above, 1.0)))
     factor = tl.where(above > 0, factor, 0.0)
@@ -137,71 +138,49 @@ def placed(frame: SimFrame, point: Sequence[float]) -> list[float]:
 
 
 class Profile(WindEffect):
-    """Base of mean winds that grow with the height above the ground; gusts grow with them.
+    r"""A mean wind that grows with the height above the ground; gusts grow with it.
+
+    The logarithmic profile of a neutral boundary layer over rough ground, zero below the roughness length, or with an
+    ``exponent`` the power law, zero below the ground:
+
+    .. math:: u(z) = u(h) \, \frac{\ln (z / z_0)}{\ln (h / z_0)}, \qquad u(z) = u(h) (z / h)^a
 
     Args:
         ground: A point on the ground, in scene units; only its height counts. In Python [m], z up.
         height: Height above the ground at which the wind is that of the ``flow`` [m].
+        roughness: Roughness length z0 [m]: 0.001 for water, 0.01 for a lawn, 0.1 for a field with hedges, 1 for a town.
+        exponent: a: about 0.1 over water, 0.14 over open land, 0.3 in towns; null for the logarithmic profile.
     """
 
     recordable = True
 
-    def __init__(self, ground: Sequence[float] = (0.0, 0.0, 0.0), height: float = 10.0) -> None:
+    def __init__(
+        self,
+        ground: Sequence[float] = (0.0, 0.0, 0.0),
+        height: float = 10.0,
+        roughness: float = 0.01,
+        exponent: float | None = None,
+    ) -> None:
         super().__init__()
         check_positive("height", height)
+        check_positive("roughness", roughness)
+        if exponent is not None:
+            check_positive("exponent", exponent)
+        elif not roughness < height:
+            raise ValueError(f"Expected `roughness` ({roughness} m) to be below `height` ({height} m): lower it.")
         self.ground, self.height = list(check_vector("ground", ground)), float(height)
+        self.roughness, self.exponent = float(roughness), exponent
 
     def in_frame(self, frame: SimFrame) -> WindEffect:
         """The ground in metres."""
         return changed(self, ground=placed(frame, self.ground))
 
-
-class LogProfile(Profile):
-    r"""The logarithmic profile of a neutral boundary layer over rough ground, zero below the roughness length.
-
-    .. math:: u(z) = u(h) \, \frac{\ln (z / z_0)}{\ln (h / z_0)}
-
-    Args:
-        ground: A point on the ground, in scene units; only its height counts.
-        height: Height above the ground at which the wind is that of the ``flow`` [m].
-        roughness: Roughness length z0 [m]: 0.001 for water, 0.01 for a lawn, 0.1 for a field with hedges, 1 for a town.
-
-    """
-
-    def __init__(
-        self, ground: Sequence[float] = (0.0, 0.0, 0.0), height: float = 10.0, roughness: float = 0.01
-    ) -> None:
-        super().__init__(ground, height)
-        check_positive("roughness", roughness)
-        if not roughness < height:
-            raise ValueError(f"Expected `roughness` ({roughness} m) to be below `height` ({height} m): lower it.")
-        self.roughness = float(roughness)
-
     def device_function(self) -> DeviceFunction:
-        scale = 1 / math.log(self.height / self.roughness)
-        return DeviceFunction(
-            log_profile, numbers=Numbers(3, lambda: [self.ground[2], self.roughness, scale]), sources=(self,)
-        )
-
-
-class PowerProfile(Profile):
-    r"""The power law :math:`u(z) = u(h) (z / h)^a`, zero below the ground.
-
-    Args:
-        ground: A point on the ground, in scene units; only its height counts.
-        height: Height above the ground at which the wind is that of the ``flow`` [m].
-        exponent: a: about 0.1 over water, 0.14 over open land, 0.3 in towns.
-
-    """
-
-    def __init__(self, ground: Sequence[float] = (0.0, 0.0, 0.0), height: float = 10.0, exponent: float = 0.14) -> None:
-        super().__init__(ground, height)
-        check_positive("exponent", exponent)
-        self.exponent = float(exponent)
-
-    def device_function(self) -> DeviceFunction:
-        numbers = Numbers(3, lambda: [self.ground[2], 1 / self.height, self.exponent])
-        return DeviceFunction(power_profile, numbers=numbers, sources=(self,))
+        if self.exponent is None:
+            function, *shape = log_profile, self.roughness, 1 / math.log(self.height / self.roughness)
+        else:
+            function, *shape = power_profile, 1 / self.height, self.exponent
+        return DeviceFunction(function, numbers=Numbers(3, lambda: [self.ground[2], *shape]), sources=(self,))
 
 
 class Plume(WindEffect):
@@ -309,7 +288,7 @@ def plane_wake(behind, aside, width, drag):
 
 @triton.jit
 def past_cylinder(v, x, numbers, now, table, OPTIONS: tl.constexpr):
-    r"""``CylinderObstacle``: zero inside, and the part along the axis stays (Lamb 1932, 68).
+    r"""``Obstacle`` without end: zero inside, and the part along the axis stays (Lamb 1932, 68).
 
     .. math::
         \mathbf{u} = \mathbf{v} + \frac{R^2}{r^2} \bigl(\mathbf{v}_\perp - 2 (\mathbf{v} \cdot \hat r) \hat r\bigr)
@@ -376,7 +355,7 @@ def _over(x, a, root):
 
 @triton.jit
 def past_ellipsoid(v, x, numbers, now, table, OPTIONS: tl.constexpr):
-    r"""``EllipsoidObstacle``: zero inside (Lamb 1932, 114).
+    r"""``Obstacle``: zero inside (Lamb 1932, 114).
 
     With :math:`\lambda` the larger root of :math:`\sum_i x_i^2 / (a_i^2 + \lambda) = 1` and
     :math:`\alpha_i(\lambda) = a b c \int_\lambda^\infty \frac{ds}{(a_i^2 + s) \Delta(s)}`, the potential is
@@ -452,101 +431,72 @@ def wake_start(drag: float) -> float:
     return 0.25 * math.sqrt(0.5 * (1 + root) / root)
 
 
-class Obstacle(WindEffect):
-    """Base of bodies in the wind: potential flow round them, and a wake behind them.
-
-    The flow is that of the wind at each place, gusts included: right for gusts much longer than the body. The wake lies
-    in the direction of the mean flow; behind an ellipsoid it is as wide, and as high, as the body is across the flow.
-    """
-
-    recordable = True
-
-    def __init__(self, center: Sequence[float], drag: float) -> None:
-        super().__init__()
-        check_positive("drag", drag, allow_zero=True)
-        self.center, self.drag = check_vector("center", center), float(drag)
-
-
 def _turned(frame: SimFrame, axes: Any) -> Any:
     """Directions, as lists, in the axes of a simulation."""
     return frame.direction_to_sim(torch.tensor(axes, dtype=torch.float64)).tolist()
 
 
-class CylinderObstacle(Obstacle):
-    """A long pole in the wind.
+class Obstacle(WindEffect):
+    """An ellipsoid in the wind, such as a hill, a hedge, a flat wall or a long pole.
+
+    Potential flow round it, and a wake behind it. The flow is that of the wind at each place, gusts included: right for
+    gusts much longer than the body. The wake lies in the direction of the mean flow; behind an ellipsoid it is as wide,
+    and as high, as the body is across the flow.
 
     Args:
-        center: A point on its axis, in scene units.
-        radius: In scene units.
-        axis: Direction of its axis.
-        drag: Drag coefficient of its wake; 1.2 for a pole in wind, 0 for no wake.
+        center: Its centre, in scene units.
+        radii: Its half axes along the axes of the scene, in scene units; null for that of a pole without end, whose two
+            others are the same.
+        rotation: Rotation about its centre, as axis times angle [degrees], in scene axes.
+        drag: Drag coefficient of its wake, below 1 for an ellipsoid; 0 for no wake, and null for 0.9, or 1.2 of a pole.
     """
+
+    recordable = True
 
     def __init__(
         self,
         center: Sequence[float],
-        radius: float,
-        axis: Sequence[float] = (0.0, 0.0, 1.0),
-        drag: float = 1.2,
+        radii: Sequence[float | None],
+        rotation: Sequence[float] = (0.0, 0.0, 0.0),
+        drag: float | None = None,
     ) -> None:
-        super().__init__(center, drag)
-        check_positive("radius", radius)
-        self.radius = float(radius)
-        length = math.hypot(*check_vector("axis", axis))
-        if not length > 0:
-            raise ValueError("Expected `axis` to have a direction, but it is zero.")
-        self.axis = [part / length for part in axis]
+        super().__init__()
+        for radius in check_vector("radii", [1.0 if radius is None else radius for radius in radii]):
+            check_positive("radii", radius)
+        self.radii = list(radii)
+        self.long: int | None = self.radii.index(None) if None in radii else None
+        if self.long is not None and (self.radii.count(None) > 1 or len(set(self.radii)) > 2):
+            raise ValueError(f"Expected `radii` of a pole to be null and twice its radius, but got {self.radii}.")
+        drag = (0.9 if self.long is None else 1.2) if drag is None else drag
+        check_positive("drag", drag, allow_zero=True)
+        if self.long is None and not drag < 1:
+            raise ValueError(f"Expected `drag` of an ellipsoid to be below 1, but got {drag}: a wall has 0.9.")
+        self.center, self.drag = check_vector("center", center), float(drag)
+        self.rotation = check_vector("rotation", rotation)
+        self.axes = rotation_of(torch.deg2rad(torch.tensor(self.rotation, dtype=torch.float64))).T.tolist()
+
+    def forward(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
+        fine = position.dtype == torch.float64 and self.long is None
+        function = self._ellipsoid(12, 9) if fine else self.device_function()
+        return blown(function, velocity, position, moment)
 
     def device_function(self) -> DeviceFunction:
+        if self.long is None:
+            return self._ellipsoid(7, 5)  # from two thirds of the distance to the root, to float32
+        axis, radius = self.axes[self.long], self.radii[self.long - 1]
         return DeviceFunction(
             past_cylinder,
             options=(self.drag > 0,),
-            numbers=Numbers(8, lambda: [*self.center, *self.axis, self.radius, self.drag]),
+            numbers=Numbers(8, lambda: [*self.center, *axis, radius, self.drag]),
             per_substep=Numbers(3, lambda moment: moment.flow),
             sources=(self,),
         )
 
-    def in_frame(self, frame: SimFrame) -> WindEffect:
-        """In metres, z up."""
-        radius = self.radius * frame.metres_per_unit
-        return changed(self, center=placed(frame, self.center), radius=radius, axis=_turned(frame, self.axis))
-
-
-class EllipsoidObstacle(Obstacle):
-    """An ellipsoid in the wind, such as a hill, a hedge or, if it is flat, a wall.
-
-    Args:
-        center: Its centre, in scene units.
-        radii: Its half axes along the axes of the scene, in scene units.
-        turn: Angle by which it is turned about the vertical [degrees].
-        drag: Drag coefficient of its wake, below 1; 0 for no wake.
-    """
-
-    def __init__(self, center: Sequence[float], radii: Sequence[float], turn: float = 0.0, drag: float = 0.9) -> None:
-        super().__init__(center, drag)
-        self.radii = list(check_vector("radii", radii))
-        for radius in self.radii:
-            check_positive("radii", radius)
-        if not drag < 1:
-            raise ValueError(f"Expected `drag` of an ellipsoid to be below 1, but got {drag}: a wall has 0.9.")
-        cos, sin = math.cos(math.radians(turn)), math.sin(math.radians(turn))
-        self.axes = [[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]]
-
-    def forward(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
-        return blown(
-            self._device_function(12, 9) if position.dtype == torch.float64 else self.device_function(),
-            velocity,
-            position,
-            moment,
-        )
-
-    def device_function(self) -> DeviceFunction:
-        return self._device_function(7, 5)  # from two thirds of the distance to the root, to float32
-
-    def _device_function(self, newton: int, duplications: int) -> DeviceFunction:
+    def _ellipsoid(self, newton: int, duplications: int) -> DeviceFunction:
         def numbers() -> list[float]:
-            size = max(self.radii)
-            shape = [*(radius / size for radius in self.radii), *ellipsoid_strength(tuple(self.radii))]
+            radii = [radius or 0.0 for radius in self.radii]
+            size = max(radii)
+            shape = [*(radius / size for radius in radii), *ellipsoid_strength(tuple(radii))]
             return [*self.center, *chain(*self.axes), size, self.drag, wake_start(self.drag), *shape]
 
         return DeviceFunction(
@@ -559,5 +509,5 @@ class EllipsoidObstacle(Obstacle):
 
     def in_frame(self, frame: SimFrame) -> WindEffect:
         """In metres, z up."""
-        radii = [radius * frame.metres_per_unit for radius in self.radii]
+        radii = [None if radius is None else radius * frame.metres_per_unit for radius in self.radii]
         return changed(self, center=placed(frame, self.center), radii=radii, axes=_turned(frame, self.axes))

@@ -6,7 +6,7 @@ Fields that the mean wind carries, winds from files, and the shelter that a body
 from __future__ import annotations
 
 import os
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -110,7 +110,7 @@ def wind_axes(flow: Tensor) -> Tensor:
     return torch.stack([x, y, torch.linalg.cross(x, y)])
 
 
-class Tabulated(WindEffect):
+class Tabulated(WindEffect, ABC):
     """Base of effects whose values are in a table: velocities that are added, or shares of the velocity that are left.
 
     Args:

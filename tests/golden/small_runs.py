@@ -213,9 +213,9 @@ CASES = {
             "aero.law": "projected",
             "wind.modulations": [named("UniformGust", delta=0.3)],
             "wind.effects": [
-                named("PowerProfile", height=2.0),
+                named("Profile", height=2.0, exponent=0.14),
                 named("Turbulence", intensity=0.3, length=1.0, cells=[32, 16, 16]),
-                named("EllipsoidObstacle", center=[-0.6, -0.1, 0.4], radii=[0.2, 0.1, 0.3]),
+                named("Obstacle", center=[-0.6, -0.1, 0.4], radii=[0.2, 0.1, 0.3]),
                 named("Shelter", cells=16),
             ],
         },

@@ -27,7 +27,7 @@ from gaussian_swaying.mpm.pins import Handle, RigidRegion
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.transfer import shifts
 from gaussian_swaying.mpm.virtual_nodes import coordinates, first_nodes, point_with_nodes, virtual_nodes
-from gaussian_swaying.wind.effects import LogProfile
+from gaussian_swaying.wind.effects import Profile
 
 EDGE = up_to(x=1.0)
 
@@ -227,7 +227,7 @@ def test_scenes_of_a_batch_have_their_own_copies(kernel_device):
     def end(points, transfer):
         up, area = torch.zeros_like(points.position), torch.full_like(points.mass, 0.01)
         up[..., 2] = 1.0
-        wind = WindField([5.0, 2.0, -1.0], effects=[LogProfile(height=3.0)])
+        wind = WindField([5.0, 2.0, -1.0], effects=[Profile(height=3.0)])
         pins = [PinnedRegion(EDGE, "hinge")]
         solver = MPMSolver(1.0, boundaries=pins, transfer=transfer, stiffness_damping=1e-3).to(up.device)
         state = solver.init_state(points)

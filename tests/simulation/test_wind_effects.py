@@ -6,7 +6,7 @@ from shared import double, waits
 
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.simulation.step import parts_of
-from gaussian_swaying.wind.effects import EllipsoidObstacle, LogProfile
+from gaussian_swaying.wind.effects import Obstacle, Profile
 from gaussian_swaying.wind.field import WindField
 from gaussian_swaying.wind.tables import Shelter
 from gaussian_swaying.wind.turbulence import Turbulence
@@ -14,15 +14,13 @@ from gaussian_swaying.wind.turbulence import Turbulence
 
 def _wind():
     gusts = Turbulence(0.3, 0.5, cells=[16, 8, 8])
-    return WindField([4.0, 1.0, 0.0], effects=[LogProfile([0, 0, -0.5], height=2.0), gusts, Shelter(8)])
+    return WindField([4.0, 1.0, 0.0], effects=[Profile([0, 0, -0.5], height=2.0), gusts, Shelter(8)])
 
 
 def test_places_are_converted_once(make_simulation):
     """Scene units to metres from the object's centre; what was given stays as it was."""
     simulation = make_simulation(scene={"metres_per_unit": 2.0})
-    given = WindField(
-        [4.0, 0.0, 0.0], effects=[EllipsoidObstacle([1.0, 2.0, 3.0], [0.5] * 3), LogProfile([0.0, 0.0, -1.0])]
-    )
+    given = WindField([4.0, 0.0, 0.0], effects=[Obstacle([1.0, 2.0, 3.0], [0.5] * 3), Profile([0.0, 0.0, -1.0])])
     simulation.wind = given
     frame = simulation.scene.frame
     expected = 2.0 * (double([1.0, 2.0, 3.0]) - frame.origin)
@@ -49,12 +47,12 @@ def test_shelter_is_refreshed_in_every_frame(make_simulation):
 def test_every_effect_can_be_named_in_a_configuration(tmp_path):
     """By its class name alone; effects are listed with their arguments."""
     effects = [
-        "{class_path: LogProfile, init_args: {height: 3.0}}",
-        "{class_path: PowerProfile}",
+        "{class_path: Profile, init_args: {height: 3.0}}",
+        "{class_path: Profile, init_args: {exponent: 0.2}}",
         "{class_path: Turbulence, init_args: {cells: [8, 8, 8]}}",
-        "{class_path: EllipsoidObstacle, init_args: {center: [0, 0, 0], radii: [1.0, 1.0, 1.0]}}",
-        "{class_path: CylinderObstacle, init_args: {center: [0, 0, 0], radius: 1.0}}",
-        "{class_path: EllipsoidObstacle, init_args: {center: [0, 0, 0], radii: [1, 2, 3]}}",
+        "{class_path: Obstacle, init_args: {center: [0, 0, 0], radii: [1.0, 1.0, 1.0]}}",
+        "{class_path: Obstacle, init_args: {center: [0, 0, 0], radii: [1, 1, null]}}",
+        "{class_path: Obstacle, init_args: {center: [0, 0, 0], radii: [1, 2, 3]}}",
         "{class_path: Shelter}",
     ]
     text = "scene: {generator: {class_path: FlagScene, init_args: {spacing: 0.1}}}\nsolver: {dx: 0.25}\n"

@@ -14,7 +14,7 @@ from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.draw import STEPS, draw_vorticity, draw_wind, streaks
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.wind.computed_air import ComputedAir
-from gaussian_swaying.wind.effects import EllipsoidObstacle
+from gaussian_swaying.wind.effects import Obstacle
 from gaussian_swaying.wind.field import WindField
 
 
@@ -91,7 +91,7 @@ def test_the_object_hides_what_is_behind_it(make_simulation):
 def test_a_run_draws_the_wind(make_simulation, tmp_path, flow):
     """For flows along and across the view, with an obstacle."""
     simulation = make_simulation()
-    simulation.wind = WindField(flow, effects=[EllipsoidObstacle([-1.0, 0.0, 0.4], [0.3] * 3)])
+    simulation.wind = WindField(flow, effects=[Obstacle([-1.0, 0.0, 0.4], [0.3] * 3)])
     simulation.run(tmp_path / "run", 1, progress=False, recorder=Recorder(renders=["wind"]))
     picture = iio.imread(tmp_path / "run" / "wind" / "00000.png")
     assert picture.shape == (18, 32, 3)

@@ -14,7 +14,7 @@ from gaussian_swaying.kernels.graphs import Replayed
 from gaussian_swaying.scenes.procedural import FlagScene, GivenScene, both
 from gaussian_swaying.simulation.step import why_not_batched
 from gaussian_swaying.wind.computed_air import BYTES, ComputedAir, resolution
-from gaussian_swaying.wind.effects import EllipsoidObstacle, LogProfile
+from gaussian_swaying.wind.effects import Obstacle, Profile
 from gaussian_swaying.wind.field import FlowKey
 
 LOW, HIGH = [-1.2, -0.9, -0.9], [1.5, 0.9, 0.9]
@@ -162,7 +162,7 @@ def test_the_law_is_no_stronger_than_what_stops_the_surface():
 def test_the_inflow_has_the_wind_of_the_end_of_the_frame():
     """Of a wind that doubles in the frame and grows with the height; the rest at a face is what lets sound leave."""
     keys = [FlowKey(0.0, [2.0, 0.0, 0.0]), FlowKey(0.02, [4.0, 0.0, 0.0])]
-    profile = LogProfile([0.0, 0.0, -1.2], height=2.0, roughness=0.05)
+    profile = Profile([0.0, 0.0, -1.2], height=2.0, roughness=0.05)
     wind = WindField(schedule=keys, interpolation="linear", effects=[profile])
     stepper, state, _ = _run(_simulation(wind=wind), 1)
     flow, moments = stepper.air.flow, state.air.reshape(10, -1)
@@ -240,7 +240,7 @@ def test_what_a_box_costs_and_resolves():
         ({"density": 0.2}, "layer of air"),
         ({"wind": (0.0, 0.0, 0.0), "speed": None}, "air.speed"),
         ({"air": ComputedAir([-0.6, -0.9, -0.9], HIGH, 24, speed=6.0)}, "within two cells"),
-        ({"wind": WindField([3.0, 0.0, 0.0], effects=[EllipsoidObstacle([0.0] * 3, [0.1] * 3)])}, "air.walls"),
+        ({"wind": WindField([3.0, 0.0, 0.0], effects=[Obstacle([0.0] * 3, [0.1] * 3)])}, "air.walls"),
         ({"still_walls": True}, r"air\.still_walls"),
         ({"speed": 0.5}, r"raise `air\.speed`"),  # the wind outruns the steps
         ({"cells": 4}, "cells"),

@@ -12,16 +12,14 @@ from shared import EYE, double, longest, near, normalized, peak, rand, randn, se
 from torch.testing import assert_close
 
 from gaussian_swaying import AeroForce, MPMSolver, SimFrame, WindField, WindForce, wind
-from gaussian_swaying._fixed import assign
+from gaussian_swaying._fixed import assign, changed
 from gaussian_swaying.kernels.derive import on_tensors
 from gaussian_swaying.wind import effects
 from gaussian_swaying.wind.effects import (
-    CylinderObstacle,
-    EllipsoidObstacle,
-    LogProfile,
     Moment,
+    Obstacle,
     Plume,
-    PowerProfile,
+    Profile,
     WindEffect,
     wake_start,
 )
@@ -40,19 +38,19 @@ def speeds(profile, heights):
 
 
 def test_the_logarithmic_profile():
-    profile = LogProfile(ground=(0.0, 0.0, -2.0), height=10.0, roughness=0.1)
+    profile = Profile(ground=(0.0, 0.0, -2.0), height=10.0, roughness=0.1)
     found = speeds(profile, [8.0, -1.0, -1.95, -5.0])  # 10 m, 1 m, below the roughness, and below the ground
     assert found == pytest.approx([8.0, 8.0 * math.log(10) / math.log(100), 0.0, 0.0])
 
 
 def test_the_power_law():
-    found = speeds(PowerProfile(ground=(0.0, 0.0, 1.0), height=10.0, exponent=0.2), [11.0, 1.3125, 0.5])
+    found = speeds(Profile(ground=(0.0, 0.0, 1.0), height=10.0, exponent=0.2), [11.0, 1.3125, 0.5])
     assert found == pytest.approx([8.0, 8.0 * 0.03125**0.2, 0.0])  # 0.03125 is half to the fifth
 
 
 def test_a_roughness_above_the_height_is_refused():
     with value_error(r"Expected `roughness` .* to be below `height`"):
-        LogProfile(height=1.0, roughness=2.0)
+        Profile(height=1.0, roughness=2.0)
 
 
 class Flat(WindEffect):
@@ -166,12 +164,12 @@ def around(obstacle, flow, place):
 
 def cylinder(axis, radius):
     """A cylinder through the origin."""
-    return CylinderObstacle([0.0] * 3, radius, axis=axis.tolist(), drag=0.0)
+    return changed(Obstacle([0.0] * 3, [None, radius, radius], drag=0.0), axes=[axis.tolist()] * 3)
 
 
 def ellipsoid(radii):
     """An ellipsoid at the origin."""
-    return EllipsoidObstacle([0.0] * 3, list(radii), drag=0.0)
+    return Obstacle([0.0] * 3, list(radii), drag=0.0)
 
 
 FLOWS = {
@@ -279,8 +277,8 @@ def test_obstacles_in_a_frame_are_those_of_the_scene(turn):
     flow = double([1.0, 0.3, -0.2])
     here, there = Moment(flow[0], flow, flow), Moment(flow[0], flow @ rotation.T, 2 * flow @ rotation.T)
     for obstacle in (
-        CylinderObstacle([1.0, 2.5, 3.0], 0.4, axis=[0.0, 1.0, 1.0]),
-        EllipsoidObstacle([1.0, 2.5, 3.0], [0.2, 0.5, 0.4], turn=turn, drag=0.0),
+        Obstacle([1.0, 2.5, 3.0], [0.4, 0.4, None], [-45.0, 0.0, 0.0]),
+        Obstacle([1.0, 2.5, 3.0], [0.2, 0.5, 0.4], rotation=[0.0, 0.0, turn], drag=0.0),
     ):
         expected = obstacle(flow, scene, here)
         moved = obstacle.in_frame(frame)
@@ -291,7 +289,7 @@ def test_obstacles_in_a_frame_are_those_of_the_scene(turn):
 
 
 def test_a_wall_shelters_what_is_behind_it():
-    wall = EllipsoidObstacle([0.0, 0.0, 0.0], [0.1, 1.0, 0.8], drag=0.9)
+    wall = Obstacle([0.0, 0.0, 0.0], [0.1, 1.0, 0.8], drag=0.9)
     wind = WindField([4.0, 0.0, 0.0], effects=[wall])
     place = torch.tensor([[-5.0, 0.0, 0.0], [1.5, 0.0, 0.0], [1.5, 4.0, 0.0], [0.0, 1.1, 0.0]])
     front, behind, aside, edge = wind.at(double(0.0), place)[:, 0].tolist()
@@ -303,8 +301,8 @@ def test_a_wall_shelters_what_is_behind_it():
 
 def test_still_air_stays_still():
     for obstacle in (
-        CylinderObstacle([0.0] * 3, 0.5),
-        EllipsoidObstacle([0.0] * 3, [1, 1, 2]),
+        Obstacle([0.0] * 3, [0.5, 0.5, None]),
+        Obstacle([0.0] * 3, [1, 1, 2]),
     ):
         wind = WindField([0.0, 0.0, 0.0], effects=[obstacle])
         found = wind.at(double(1.0), 2 * _directions())
@@ -314,10 +312,10 @@ def test_still_air_stays_still():
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: CylinderObstacle([0.0] * 3, -1.0), "`radius` to be positive"),
-        (lambda: EllipsoidObstacle([0.0] * 3, [1.0] * 3, drag=1.2), "`drag` of an ellipsoid to be below 1"),
-        (lambda: CylinderObstacle([0.0] * 3, 1.0, axis=[0.0] * 3), "`axis` to have a direction"),
-        (lambda: EllipsoidObstacle([0.0] * 3, [1.0, 2.0]), "`radii` to have 3 numbers"),
+        (lambda: Obstacle([0.0] * 3, [-1.0, -1.0, None]), "`radii` to be positive"),
+        (lambda: Obstacle([0.0] * 3, [1.0] * 3, drag=1.2), "`drag` of an ellipsoid to be below 1"),
+        (lambda: Obstacle([0.0] * 3, [1.0, 2.0, None]), "`radii` of a pole"),
+        (lambda: Obstacle([0.0] * 3, [1.0, 2.0]), "`radii` to have 3 numbers"),
     ],
 )
 def test_impossible_obstacles_are_refused(make, words):

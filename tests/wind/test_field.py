@@ -11,7 +11,7 @@ from torch.testing import assert_close
 from gaussian_swaying import GaussianGust, SineSway, UniformGust, WindField
 from gaussian_swaying._fixed import assign, changed
 from gaussian_swaying.kernels.derive import on_tensors
-from gaussian_swaying.wind.effects import LogProfile
+from gaussian_swaying.wind.effects import Profile
 from gaussian_swaying.wind.field import FlowKey, counter_uniform, stream_start
 
 
@@ -110,7 +110,7 @@ def test_the_kernel_refuses_a_wind_that_it_does_not_know():
 
 def test_winds_of_other_kinds_are_not_joined():
     assert WindField.together([_gusty(1), WindField([1.0, 0.0, 0.0])]) is None
-    assert WindField.together([WindField([1.0, 0.0, 0.0], effects=[LogProfile()])]) is None
+    assert WindField.together([WindField([1.0, 0.0, 0.0], effects=[Profile()])]) is None
 
 
 def test_seeds_of_several_scenes():

@@ -15,7 +15,7 @@ from gaussian_swaying import AeroForce, MPMSolver, SpatialWind, UniformGust, Win
 from gaussian_swaying._fixed import assign, changed
 from gaussian_swaying.geometry.patches import deform_patch
 from gaussian_swaying.mpm.device_functions import Packed
-from gaussian_swaying.wind.effects import CylinderObstacle, EllipsoidObstacle, LogProfile, Plume, PowerProfile
+from gaussian_swaying.wind.effects import Obstacle, Plume, Profile
 from gaussian_swaying.wind.field import FlowKey
 from gaussian_swaying.wind.patches import Patches
 from gaussian_swaying.wind.tables import CarriedField, RecordedWind, Shelter
@@ -174,7 +174,7 @@ def test_copies_feel_one_wind_turned_and_later():
     assert peak(later[:, 0]) < 1e-12 < 0.9 < found[:, 1, 0, 0].min()
 
 
-@pytest.mark.parametrize("wind", [Whirl(), WindField([4.0, 1.0, 0.0], effects=[PowerProfile(height=2.0)])])
+@pytest.mark.parametrize("wind", [Whirl(), WindField([4.0, 1.0, 0.0], effects=[Profile(height=2.0, exponent=0.14)])])
 def test_copies_feel_the_wind_at_their_places(wind):
     turn, shift = _turn(30.0), double([2.0, -1.0, 0.5])
     load, position = _blown([wind] * 2, turn, shift.tolist(), 0.0)
@@ -199,7 +199,7 @@ def test_a_force_in_many_winds():
 @pytest.mark.parametrize("batch", [(), (2,)])
 def test_a_wind_with_effects_is_asked_where_the_particles_are(batch):
     """For all substeps at once or one by one; a batch takes winds with and without."""
-    effects = [PowerProfile([0.0, 0.0, -1.0], height=2.0), Turbulence(0.3, 0.2, cells=[16, 8, 8])]
+    effects = [Profile([0.0, 0.0, -1.0], height=2.0, exponent=0.14), Turbulence(0.3, 0.2, cells=[16, 8, 8])]
     shaped = WindField([3.0, 1.0, 0.0], modulations=[UniformGust(0.5, interval=4 * DT)], effects=effects)
     _, state, load = _setting([shaped, GUSTS] if batch else shaped, batch)
     assert not load.uniform
@@ -263,16 +263,16 @@ def _wind(name):
     gusts = [UniformGust(0.5, interval=2 * DT)]
     turbulence = Turbulence(0.5, 0.1, cells=[8, 6, 4], spacing=0.03)
     effects = {
-        "all": [turbulence, LogProfile(**low, roughness=0.02)],
+        "all": [turbulence, Profile(**low, roughness=0.02)],
         "sheltered": [turbulence, Shelter(cells=8, strength=20.0)],
-        "half": [PowerProfile(**low, exponent=0.3), _field()],
+        "half": [Profile(**low, exponent=0.3), _field()],
         "several": [
-            LogProfile(**low, roughness=0.02),
-            CylinderObstacle(MIDDLE, 0.05, axis=[0.0, 1.0, 1.0]),
+            Profile(**low, roughness=0.02),
+            Obstacle(MIDDLE, [0.05, 0.05, None], [-45.0, 0.0, 0.0]),
             turbulence,
-            EllipsoidObstacle(MIDDLE, [0.03, 0.08, 0.05], turn=20.0, drag=0.0),
+            Obstacle(MIDDLE, [0.03, 0.08, 0.05], rotation=[0.0, 0.0, 20.0], drag=0.0),
             Plume([0.13, 0.17, 0.12], 0.05, heat=1e6),
-            EllipsoidObstacle(MIDDLE, [0.01, 0.1, 0.05]),
+            Obstacle(MIDDLE, [0.01, 0.1, 0.05]),
             _recorded(),
         ],
     }
@@ -397,15 +397,15 @@ def test_the_host_reads_nothing_of_a_wind():
 def test_what_the_kernels_do_not_know_runs_in_torch():
     """A subclass does not inherit the device function, nor does a wind have one without those of all effects."""
 
-    class Doubled(LogProfile):
+    class Doubled(Profile):
         def forward(self, velocity, position, moment):
             return 2 * super().forward(velocity, position, moment)
 
-    class Same(LogProfile):
-        device_function = LogProfile.device_function
+    class Same(Profile):
+        device_function = Profile.device_function
 
     assert Doubled().device_function() is None
-    assert Same().device_function().function is LogProfile().device_function().function
-    for effects in ([Doubled()], [Same(), Doubled(), EllipsoidObstacle(MIDDLE, [0.05] * 3)]):
+    assert Same().device_function().function is Profile().device_function().function
+    for effects in ([Doubled()], [Same(), Doubled(), Obstacle(MIDDLE, [0.05] * 3)]):
         wind = WindField([1.0, 0.0, 0.0], effects=effects)
         assert _setting(wind)[2].device_function() is None

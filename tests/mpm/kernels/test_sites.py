@@ -7,7 +7,7 @@ from shared import peak, seeded, solid, unit, up_to
 from gaussian_swaying import AeroForce, MaterialPoints, MPMSolver, WindField, WindForce
 from gaussian_swaying.mpm.modes import Modes
 from gaussian_swaying.mpm.pins import PinnedRegion
-from gaussian_swaying.wind.effects import LogProfile
+from gaussian_swaying.wind.effects import Profile
 from gaussian_swaying.wind.patches import Patches
 from gaussian_swaying.wind.turbulence import look
 
@@ -33,7 +33,7 @@ def solver(**more):
 WINDS = {
     "storm": lambda: look("storm"),
     "steady": lambda: WindField([6.0, 2.0, 0.0]),
-    "profile": lambda: WindField([6.0, 2.0, 0.0], effects=[LogProfile(ground=(0.0, 0.0, -0.1), height=1.0)]),
+    "profile": lambda: WindField([6.0, 2.0, 0.0], effects=[Profile(ground=(0.0, 0.0, -0.1), height=1.0)]),
 }
 
 

@@ -150,9 +150,7 @@ def test_the_starter_of_a_plant_by_its_modes(sway, in_node):
     assert longest(state.position - steady.position) > 0.1 * motion
     assert error < ROUNDED
     assert told[0]["substeps"] == steps
-    effects = [
-        {"class_path": f"gaussian_swaying.wind.{name}"} for name in ("turbulence.Turbulence", "effects.LogProfile")
-    ]
+    effects = [{"class_path": f"gaussian_swaying.wind.{name}"} for name in ("turbulence.Turbulence", "effects.Profile")]
     with value_error(r"of which `solver.formulation: modes` takes one Turbulence\.$"):
         check(sway(wind={"effects": effects}))
 
@@ -243,7 +241,7 @@ REFUSED = {
     "material.bending": {"material": {"bending": "plate"}},
     "aero.added_mass": {"aero": {"added_mass": 0.5}},
     "forces": {"forces": [{"class_path": f"{__name__}.Lift"}]},
-    "wind.effects": {"wind": {"effects": [{"class_path": "gaussian_swaying.wind.effects.PowerProfile"}]}},
+    "wind.effects": {"wind": {"effects": [{"class_path": "gaussian_swaying.wind.effects.Profile"}]}},
     "start": {"solver": {"boundaries": [{"class_path": "PinnedRegion", "init_args": {"region": SIDE, "end": 1.0}}]}},
     "solver.boundaries": {
         "solver": {"boundaries": [{"class_path": "VelocityBox", "init_args": {"region": SIDE, "velocity": [1, 0, 0]}}]}

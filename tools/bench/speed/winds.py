@@ -9,7 +9,7 @@ import torch
 from bench.runner import Row, study
 from bench.speed.timing import CUBE, DT, STEPS, in_turns, load, sheet, timed, waves, wind
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.wind.effects import CylinderObstacle, LogProfile, WindEffect
+from gaussian_swaying.wind.effects import Obstacle, Profile, WindEffect
 from gaussian_swaying.wind.field import UniformGust, WindField
 from gaussian_swaying.wind.tables import Shelter
 from gaussian_swaying.wind.turbulence import Turbulence
@@ -17,13 +17,13 @@ from gaussian_swaying.wind.turbulence import Turbulence
 
 def effects() -> dict[str, list[WindEffect]]:
     """The effects of each wind; the first is that of the others' ratios."""
-    air, profile = Turbulence(0.2, 0.5, cells=(256, 128, 128)), LogProfile([0.0, 0.0, -1.0], height=2.0)
+    air, profile = Turbulence(0.2, 0.5, cells=(256, 128, 128)), Profile([0.0, 0.0, -1.0], height=2.0)
     return {
         "uniform": [],
         "turbulence": [air],
         "profile, turbulence": [profile, air],
         "profile, turbulence, shelter": [profile, air, Shelter()],
-        "cylinder": [CylinderObstacle([-0.5, 0.0, 0.0], 0.1, axis=[0.0, 1.0, 0.0])],
+        "cylinder": [Obstacle([-0.5, 0.0, 0.0], [0.1, None, 0.1])],
     }
 
 
