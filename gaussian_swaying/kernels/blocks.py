@@ -308,16 +308,14 @@ class Emitter:
         shape = () if axis is None else x.shape[:axis] + x.shape[axis + 1 :]
         if x.lanes == 1 or (axis is not None and x.shape[axis] == 1):
             return replace(x, shape=shape, first=None)
-        scalar = TYPES[x.kind]
-        if x.floating and which == "sum":
-            value = self._sum(x)
-        else:
-            names = {"sum": "add", "max": "fmax" if x.floating else "smax", "min": "fmin" if x.floating else "smin"}
-            value = self.intrinsic(f"llvm.vector.reduce.{names[which]}", [x.value], scalar, [x.value.type])
+        if x.floating:
+            return Block(self._halved(which, x), x.kind, shape)
+        names = {"sum": "add", "max": "smax", "min": "smin"}
+        value = self.intrinsic(f"llvm.vector.reduce.{names[which]}", [x.value], TYPES[x.kind], [x.value.type])
         return Block(value, x.kind, shape)
 
-    def _sum(self, x: Block) -> Any:
-        """Sum of the lanes in halves: lane k with lane k + n/2, and so on."""
+    def _halved(self, which: str, x: Block) -> Any:
+        """Sum, or largest or smallest, of the lanes in halves: lane k with lane k + n/2, and so on."""
         value, lanes, b = x.value, x.lanes, self.builder
         index = ir.IntType(32)
         while lanes > 1:
@@ -327,7 +325,11 @@ class Emitter:
                 b.shuffle_vector(value, undefined, ir.Constant(ir.VectorType(index, half), list(range(k, k + half))))
                 for k in (0, half)
             )
-            value, lanes = b.fadd(low, high), half
+            if which == "sum":
+                value = b.fadd(low, high)
+            else:
+                value = self.extreme(which, Block(low, x.kind, (half,)), Block(high, x.kind, (half,))).value
+            lanes = half
         return b.extract_element(value, index(0))
 
     def running_sum(self, x: Block) -> Block:

@@ -299,21 +299,23 @@ class Recording:
     """Launches, and functions between them, that can be run again; their tensors must stay where they are."""
 
     def __init__(self) -> None:
-        self._parts: list[list[tuple[int, Any, int]] | Callable[[], object]] = []
-        self._held: list[Any] = []  # tensors and arguments that the launches refer to
+        self.parts: list[list[tuple[int, Any, int]] | Callable[[], object]] = []
+        """Launches in a row (address of the kernel, arguments, number of programs), and functions between them."""
+        self.held: list[tuple[Any, Sequence[Tensor]]] = []
+        """The arguments of each launch, and the tensors that they refer to."""
         self._rows: dict[int, Any] = {}
 
     def add(self, address: int, arguments: Any, programs: int, tensors: Sequence[Tensor]) -> None:
-        if not self._parts or not isinstance(self._parts[-1], list):
-            self._parts.append([])
-        self._parts[-1].append((address, arguments, programs))  # type: ignore[union-attr]
-        self._held.append((arguments, tensors))
+        if not self.parts or not isinstance(self.parts[-1], list):
+            self.parts.append([])
+        self.parts[-1].append((address, arguments, programs))  # type: ignore[union-attr]
+        self.held.append((arguments, tensors))
 
     def call(self, change: Callable[[], object]) -> None:
-        self._parts.append(change)
+        self.parts.append(change)
 
     def replay(self) -> None:
-        for k, part in enumerate(self._parts):
+        for k, part in enumerate(self.parts):
             if not isinstance(part, list):
                 part()
                 continue
@@ -324,7 +326,7 @@ class Recording:
             _run_rows(self._rows[k], len(part))
 
     def reset(self) -> None:
-        self._parts, self._held, self._rows = [], [], {}
+        self.parts, self.held, self._rows = [], [], {}
 
 
 class _Current(threading.local):

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib.util
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache
 from typing import Any
 
@@ -17,7 +19,9 @@ MAX_INDEX = 2**31
 """Number of entries of a buffer that kernels can address, with 32-bit indices."""
 
 LANES = 8
-"""Lanes of a program on a CPU."""
+"""Lanes of a program on a CPU, outside of :func:`narrowed`."""
+
+_LANES: ContextVar[int] = ContextVar("lanes", default=LANES)
 
 
 @triton.jit
@@ -59,9 +63,19 @@ def replaces(given: Iterable[Tensor], dtype: torch.dtype | None = torch.float32)
     return not wanted and compiles(known[0].device.type)
 
 
-def lanes(device: torch.device, gpu: int, cpu: int = LANES) -> int:
+def lanes(device: torch.device, gpu: int, cpu: int | None = None) -> int:
     """The size of a block: that for a GPU, or for a CPU, whose blocks have one axis that is longer than one."""
-    return gpu if device.type == "cuda" or INTERPRETED else cpu
+    return gpu if device.type == "cuda" or INTERPRETED else _LANES.get() if cpu is None else cpu
+
+
+@contextmanager
+def narrowed(count: int) -> Iterator[None]:
+    """Within the block, programs on a CPU have so many lanes, where this thread starts them."""
+    token = _LANES.set(count)
+    try:
+        yield
+    finally:
+        _LANES.reset(token)
 
 
 def wide(device: torch.device) -> bool:

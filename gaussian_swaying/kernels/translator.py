@@ -25,9 +25,6 @@ from gaussian_swaying.kernels import elementary
 from gaussian_swaying.kernels.blocks import ADDRESS, TYPES, Block, Emitter, Pointer, TranslationError, Value, is_number
 from gaussian_swaying.kernels.language import Language, Name
 
-UNROLLED = 4
-"""Longest loop of a constant length that is unrolled; the language's ``static_range`` always is."""
-
 _OPERATIONS: dict[type, tuple[str, Callable[[Any, Any], Any]]] = {
     ast.Add: ("+", operator.add), ast.Sub: ("-", operator.sub), ast.Mult: ("*", operator.mul),
     ast.Div: ("/", operator.truediv), ast.FloorDiv: ("//", operator.floordiv), ast.Mod: ("%", operator.mod),
@@ -64,10 +61,14 @@ def translate(kernel: Any, constants: dict[str, Any], arguments: dict[str, str],
         arguments: The kinds of the others, in order: ``i`` and ``f`` for a number, ``*`` and a type for a pointer.
         real: Type of floating point numbers: f32 or f64.
     """
-    return _Translator(real).kernel(kernel, constants, arguments)
+    return Translator(real).kernel(kernel, constants, arguments)
 
 
-class _Translator(Emitter):
+class Translator(Emitter):
+    """Carries kernels out; see :func:`translate`."""
+
+    unrolled = 4
+    """Longest loop of a constant length that is unrolled; the language's ``static_range`` always is."""
     _globals: dict[str, Any] | None = None
     """Names of the module of the function that is carried out."""
     _line = 1
@@ -75,10 +76,13 @@ class _Translator(Emitter):
     _leave: Any = None
     """The block behind the kernel, where it may end now: outside of its loops and of the functions that it calls."""
 
-    def kernel(self, kernel: Any, constants: dict[str, Any], arguments: dict[str, str]) -> ir.Module:
+    def kernel(
+        self, kernel: Any, constants: dict[str, Any], arguments: dict[str, str], name: str = "kernel"
+    ) -> ir.Module:
+        """Add the function of a kernel to the module, under some name."""
         number = TYPES["i64"]
         kind = ir.FunctionType(ir.VoidType(), [ADDRESS, number, number])
-        function = ir.Function(self.module, kind, "kernel")
+        function = ir.Function(self.module, kind, name)
         entry = function.append_basic_block("entry")
         self.entry = ir.IRBuilder(entry)
         start = function.append_basic_block("start")
@@ -559,7 +563,7 @@ class _Translator(Emitter):
 
     def _range(self, *limits: Value) -> Value:
         start, end, step = (0, *limits, 1) if len(limits) == 1 else (*limits, 1)[:3]
-        if all(is_number(limit) for limit in (start, end, step)) and len(range(start, end, step)) <= UNROLLED:
+        if all(is_number(limit) for limit in (start, end, step)) and len(range(start, end, step)) <= self.unrolled:
             return range(start, end, step)
         return _Loop(start, end, step)
 
@@ -667,4 +671,4 @@ def _source(function: Any) -> tuple[ast.FunctionDef, list[str], dict[str, Any], 
     return tree, names, defaults, marked
 
 
-__all__ = ["TranslationError", "translate"]
+__all__ = ["TranslationError", "Translator", "translate"]

@@ -267,7 +267,7 @@ def test_launches_from_several_threads_of_python(folder, use_threads):
         start.wait()
         with cpu.recording() as made:
             found[k] = [_shifted(float(k)) for _ in range(5)]
-        recorded[k] = [len(part) for part in made._parts]
+        recorded[k] = [len(part) for part in made.parts]
 
     crew = [threading.Thread(target=work, args=(k,)) for k in range(4)]
     for thread in crew:
