@@ -215,9 +215,9 @@ export class GpuSolver extends Solver {
       POINTS: this.points, SPREAD: counts.spread, NODES: counts.accelerate, ROWS: counts.rate, AFFECTED: counts.hold,
       PLANES: head.planes.length, OBSTACLES: counts.meet && head.obstacles.length, SAMPLES: counts.meet, ITERATIONS: head.iterations,
       DX: head.dx, INVERSE: 1 / head.dx, GRAVITY_X: head.gravity[0], GRAVITY_Y: head.gravity[1],
-      GRAVITY_Z: head.gravity[2], DAMPING: head.damping, VISCOUS: head.viscous, WINDY: !this.idle,
+      GRAVITY_Z: head.gravity[2], DAMPING: head.damping, VISCOUS: head.viscous, WINDY: Number(!this.idle),
       DRAG: aero.drag, FRICTION: aero.friction, LIFT: aero.lift, AIR: aero.airDensity, AERO_LAW: aero.law,
-      IMPLICIT: aero.implicit, MOST_AREA: Math.min(aero.maxAreaRatio, 1e30), QUICK, STRONGEST,
+      IMPLICIT: Number(aero.implicit), MOST_AREA: Math.min(aero.maxAreaRatio, 1e30), QUICK, STRONGEST,
     };
     const visibility = globalThis.GPUShaderStage.COMPUTE;
     const layoutOf = (entries) => device.createBindGroupLayout({ entries: entries.map((entry) => ({ visibility, ...entry })) });
