@@ -10,7 +10,7 @@ from pathlib import Path
 from PIL import Image
 
 from gaussian_swaying import suggest
-from gaussian_swaying.gaussians.export import export_cloud
+from gaussian_swaying.gaussians.formats import export_cloud
 from gaussian_swaying.scenes import FlagScene
 
 

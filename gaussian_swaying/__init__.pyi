@@ -5,7 +5,7 @@ from .captures.capture import read_capture as read_capture
 from .evaluation.compare import compare_run as compare_run
 from .fitting.fit import fit as fit
 from .gaussians.cloud import GaussianCloud as GaussianCloud
-from .gaussians.export import export_cloud as export_cloud
+from .gaussians.formats import export_cloud as export_cloud
 from .gaussians.formats import read_gaussians as read_gaussians
 from .gaussians.model import GaussianSurfaceModel as GaussianSurfaceModel
 from .gaussians.ply import write_ply as write_ply

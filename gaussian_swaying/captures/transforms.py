@@ -36,7 +36,7 @@ def read_transforms(path: Path) -> tuple[list[PosedImage], list[str], Path | Non
     """Read the cameras of a capture in the style of NeRF, Blender, instant-ngp or Nerfstudio.
 
     Intrinsics come from the frame or from the top of the file, as in
-    :func:`~gaussian_swaying.rendering.cameras.transforms_json.camera_from_transforms`; if ``w`` and ``h`` are missing,
+    :func:`~gaussian_swaying.rendering.cameras.transforms_json.camera_of_transforms`; if ``w`` and ``h`` are missing,
     the size of the image is used. ``file_path`` may have no extension. Distortion is ``k1``, ``k2``, ``k3``, ``p1`` and
     ``p2``. ``mask_path`` names the mask of an image. The splits come from one file per split, or from the lists
     ``train_filenames``, ``val_filenames`` and ``test_filenames``.

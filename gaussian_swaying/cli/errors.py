@@ -28,6 +28,7 @@ from gaussian_swaying.kernels.cpu import compiled, compiled_sentence
 from gaussian_swaying.runs.signals import exit_code
 
 OK, BUG, BAD_INPUT = 0, 1, 2
+DEVICE: Any = {"default": "auto", "choices": ("auto", "cpu", "cuda"), "help": "auto takes a GPU if there is one"}
 PACKAGE = Path(__file__).parents[1]
 LIBRARIES = {Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib")}
 """Folders of Python and of what is installed."""

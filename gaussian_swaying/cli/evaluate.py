@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gaussian_swaying import _program as program
-from gaussian_swaying.cli.errors import run_command
+from gaussian_swaying.cli.errors import DEVICE, run_command
 from gaussian_swaying.simulation.model import resolve_device
 
 
@@ -31,7 +31,7 @@ def build_parser() -> argparse.ArgumentParser:
     add("--points", type=int, default=10_000, help="points on the surface, and largest number of particles")
     add("--seed", type=int, default=0, help="seed of the points")
     add("--no-video", action="store_true", help="do not make comparison.mp4")
-    add("--device", default="auto", choices=("auto", "cpu", "cuda"), help="auto takes a GPU if there is one")
+    add("--device", **DEVICE)
     fvd = parser.add_argument_group("Fréchet video distance")
     fvd.add_argument("--i3d", metavar="FILE", help="I3D network as TorchScript; without it there is no FVD")
     fvd.add_argument("--clip-length", type=int, default=16, help="frames in a clip")

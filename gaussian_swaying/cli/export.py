@@ -14,8 +14,15 @@ import torch
 from gaussian_swaying import _program as program
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying.cli.errors import run_command  # first, as it sets up threads
-from gaussian_swaying.gaussians.export import SUFFIXES, export_cloud, export_frames, format_of, numbered
-from gaussian_swaying.gaussians.formats import READABLE, read_gaussians
+from gaussian_swaying.gaussians.formats import (
+    FORMATS,
+    endings,
+    export_cloud,
+    export_frames,
+    format_of,
+    numbered,
+    read_gaussians,
+)
 from gaussian_swaying.gaussians.spz import VERSIONS
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.simulation.simulation import RecordedRun
@@ -27,12 +34,13 @@ def build_options() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog=program.name("export"), description=__doc__)
     parser.add_argument(
         "source",
-        help=f"A {READABLE}; or the folder of a run, for its frames as splats or, with --web, as a page.",
+        help=f"A splat ({', '.join(endings())}); or the folder of a run, for its frames as splats or, with --web, as a "
+        "page.",
     )
     parser.add_argument(
         "target",
         nargs="?",
-        help=f"File to write; its name ends in one of {', '.join(SUFFIXES.values())}, for a run, unless it is USD, "
+        help=f"File to write; its name ends in one of {', '.join(endings(written=True))}, for a run, unless it is USD, "
         "with # for the digits of the frame, as in frame_####.spz; or .sway for a film; or with "
         "--web .html (default: film.html in the folder of the run).",
     )
@@ -96,16 +104,16 @@ def export(options: argparse.Namespace) -> None:
         refuse("a film", given | {"--spz-version": options.spz_version, "--apart": options.apart or None})
         return export_web(options)
     if options.target is None:
-        raise ValueError(f"Expected a file to write, whose name ends in one of {', '.join(SUFFIXES.values())}.")
-    format = format_of(options.target)
-    if format != "spz" and options.spz_version is not None:
+        raise ValueError(f"Expected a file to write, whose name ends in one of {', '.join(endings(written=True))}.")
+    format = FORMATS[format_of(options.target)]
+    if "spz_version" not in format.options and options.spz_version is not None:
         raise ValueError("--spz-version is only for .spz files: leave it out.")
     if Path(options.source).is_dir():
         refuse("a run", given)
         return export_run(options)
     if options.apart:
         raise ValueError("--apart is only for the frames of a run: leave it out.")
-    if format not in ("usd", "glb") and any(value is not None for value in given.values()):
+    if not format.in_metres and any(value is not None for value in given.values()):
         raise ValueError(
             "--up and --metres-per-unit are only for USD and glTF, as other formats have no up direction: leave them "
             "out, or use a target that ends in .usdc or .glb."
@@ -115,7 +123,8 @@ def export(options: argparse.Namespace) -> None:
     frame = SimFrame.fit(torch.zeros(1, 3), options.up or (0.0, 0.0, 1.0), metres_per_unit=metres)
     place: dict[str, Any] = {"metres_per_unit": metres, "rotation": frame.rotation}
     export_cloud(options.target, read_gaussians(options.source), spz_version=options.spz_version or 3, **place)
-    tell(format, frame, "as given" if any(given.values()) else "by default")
+    if format.in_metres:
+        tell(frame, "as given" if any(given.values()) else "by default")
     print(f"wrote {options.target}")
 
 
@@ -126,28 +135,28 @@ def refuse(what: str, given: dict[str, Any]) -> None:
             raise ValueError(f"{name} is not for {what}, which needs none: leave it out.")
 
 
-def tell(format: str, frame: SimFrame, origin: str) -> None:
+def tell(frame: SimFrame, origin: str) -> None:
     """Print the frame of a file in metres."""
-    if format in ("usd", "glb"):
-        up = [round(v, 3) + 0.0 for v in frame.rotation[2].tolist()]
-        print(f"up {up}, 1 scene unit = {frame.metres_per_unit:.6g} m ({origin})")
+    up = [round(v, 3) + 0.0 for v in frame.rotation[2].tolist()]
+    print(f"up {up}, 1 scene unit = {frame.metres_per_unit:.6g} m ({origin})")
 
 
 def export_run(options: argparse.Namespace) -> None:
     """Write the frames of a run, and report the files."""
-    target, format = Path(options.target), format_of(options.target)
+    target, format = Path(options.target), FORMATS[format_of(options.target)]
     run = RecordedRun(Path(options.source))
     frame, fps = run.simulation.scene.frame, 1 / run.simulation.frame_dt
     place: dict[str, Any] = {"metres_per_unit": frame.metres_per_unit, "rotation": frame.rotation}
     place["spz_version"] = options.spz_version or 3
     still = target.with_name(numbered(target.name, "still"))
-    apart = options.apart and format != "usd" and not run.simulation.scene.all_move
+    apart = options.apart and not format.film and not run.simulation.scene.all_move
     frames = (moved.part_to_cloud(moving=True) if apart else moved.to_cloud() for moved in run.frames())
     files = export_frames(target, frames, fps, **place)
     if apart:
         export_cloud(still, run.simulation.scene.rest().part_to_cloud(moving=False), **place)
         print(f"wrote {still}, which never moves")
-    tell(format, frame, "from the run")
+    if format.in_metres:
+        tell(frame, "from the run")
     print(f"wrote {target}, {len(files)} files" if len(files) > 1 else f"wrote {target}")
 
 

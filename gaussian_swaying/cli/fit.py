@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gaussian_swaying import _program as program
-from gaussian_swaying.cli.errors import guessing, run_command
+from gaussian_swaying.cli.errors import DEVICE, guessing, run_command
 from gaussian_swaying.cli.preview import joined
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.runs.signals import stop_signals
@@ -38,7 +38,7 @@ def build_parser() -> argparse.ArgumentParser:
     add("--check", action="store_true", help="only write the files and pictures to look at before the fit")
     add("--output", help="folder for the results; outputs/fits/<name of the film or file> if left out")
     add("--resume", action="store_true", help="with --config: continue the fit in the folder after its last iteration")
-    add("--device", default="auto", choices=("auto", "cpu", "cuda"), help="auto takes a GPU if there is one")
+    add("--device", **DEVICE)
     return parser
 
 

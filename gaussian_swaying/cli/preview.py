@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from gaussian_swaying import _program as program
-from gaussian_swaying.cli.errors import guessing, parser_sentence, run_command
+from gaussian_swaying.cli.errors import DEVICE, guessing, parser_sentence, run_command
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.config.material_names import NAMES
 from gaussian_swaying.gaussians.formats import read_gaussians
@@ -72,7 +72,7 @@ def build_options() -> argparse.ArgumentParser:
     add("--quality", default="normal", metavar="Q", help=f"grid: {', '.join(QUALITIES)} (default: normal)")
     add("--verbose", action="store_true", help="print all numbers and reasons, not only what was guessed")
     add("--height", type=int, default=540, help="height of the picture [pixels]")
-    add("--device", default="auto", choices=("auto", "cpu", "cuda"), help="auto takes a GPU if there is one")
+    add("--device", **DEVICE)
     return parser
 
 

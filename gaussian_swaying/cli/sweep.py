@@ -10,7 +10,7 @@ from pathlib import Path
 
 from gaussian_swaying import _program as program
 from gaussian_swaying._checks import first_line
-from gaussian_swaying.cli.errors import command, guessing, run_command, sentence
+from gaussian_swaying.cli.errors import DEVICE, command, guessing, run_command, sentence
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.runs.signals import stop_signals
 from gaussian_swaying.simulation.simulation import Simulation
@@ -37,7 +37,7 @@ def build_parser() -> argparse.ArgumentParser:
         default=1,
         help="how often a failed run is tried again; three times as often if its process was killed",
     )
-    add("--device", default="auto", choices=("auto", "cpu", "cuda"), help="auto takes a GPU if there is one")
+    add("--device", **DEVICE)
     add(
         "--together",
         type=int,

@@ -12,7 +12,7 @@ import re
 import sys
 import tempfile
 from argparse import SUPPRESS, Action, ArgumentError, _ArgumentGroup
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from types import UnionType
@@ -40,7 +40,7 @@ CAMERA_PATHS = (CaptureCamera, KeyframedCamera)
 EFFECTS = (FrozenWind, Shelter, Turbulence)
 # options that a configuration file cannot contain; settings that may change when a run is resumed
 COMMAND_LINE_ONLY = ("preset",)
-RUN_ONLY = ("config", "output", "device", "frames", "resume", "slow", "loop")
+RUN_ONLY = ("config", "output", "device", "frames", "resume")
 # constructor arguments that a YAML file sets within a component instead; components that may be null
 PYTHON_ONLY = ("up", "hold", "renderer", "cloud")
 NULLABLE = ("air", "contact", "normalisation")
@@ -105,18 +105,8 @@ def build_parser(schema: type) -> ArgumentParser:
         default=False,
         help="Continue the run found in the output folder.",
     )
-    parser.add_argument(
-        "--slow", type=float, default=1.0, help="Slow motion: each second of the wind takes SLOW seconds."
-    )
-    parser.add_argument(
-        "--loop",
-        type=float,
-        nargs="?",
-        const=1.0,
-        default=0.0,
-        help="A film that closes: its last second, or LOOP seconds, become its beginning. It has as many frames "
-        "as asked for; more are simulated.",
-    )
+    for name, own in OPTIONS.items():
+        parser.add_argument(f"--{name}", type=type(own.default), default=own.default, help=own.help, **own.more)
     groups = _groups(schema)
     for name, component in groups.items():
         parser.add_class_arguments(component, name)
@@ -258,26 +248,64 @@ def check_settings(schema: type, settings: Namespace) -> None:
     check_frames("frames", settings.frames)
 
 
-def as_filmed(settings: Namespace) -> Namespace:
-    """Settings in which ``slow`` and ``loop`` are those of the frames and of the recorder."""
-    filmed, slow = settings.clone(), settings.slow
-    check_positive("slow", slow)
-    check_positive("loop", settings.loop, allow_zero=True)
-    if slow != 1:
-        filmed.recorder.fps = filmed.recorder.fps or 1 / filmed.frame_dt
-        filmed.frames = round((filmed.frames - 1) * slow) + 1
-        filmed.frame_dt = filmed.frame_dt / slow
-    if settings.loop:
-        filmed.recorder.loop = settings.loop / slow
-        filmed.frames += round(filmed.recorder.loop / filmed.frame_dt)
-    filmed.slow, filmed.loop = 1.0, 0.0
-    return filmed
+@dataclasses.dataclass(frozen=True)
+class Option:
+    """An option that stands for other fields.
+
+    Args:
+        default: Its value if it is not given.
+        help: What it does.
+        apply: Changes settings, which have its value.
+        more: Further arguments of ``add_argument``.
+    """
+
+    default: Any
+    help: str
+    apply: Callable[[Namespace], None]
+    more: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+
+def _slow(filmed: Namespace) -> None:
+    check_positive("slow", filmed.slow)
+    filmed.recorder.fps = filmed.recorder.fps or 1 / filmed.frame_dt
+    filmed.frames = round((filmed.frames - 1) * filmed.slow) + 1
+    filmed.frame_dt = filmed.frame_dt / filmed.slow
+
+
+def _loop(filmed: Namespace) -> None:
+    check_positive("loop", filmed.loop)
+    filmed.recorder.loop = filmed.loop / filmed.slow
+    filmed.frames += round(filmed.recorder.loop / filmed.frame_dt)
+
+
+OPTIONS = {
+    "slow": Option(1.0, "Slow motion: each second of the wind takes SLOW seconds.", _slow),
+    "loop": Option(
+        0.0,
+        "A film that closes: its last second, or LOOP seconds, become its beginning. It has as many frames as asked "
+        "for; more are simulated.",
+        _loop,
+        {"nargs": "?", "const": 1.0},
+    ),
+}
+"""Options that stand for other fields, in the order in which they apply; another entry is one more."""
+
+
+def applied(settings: Namespace) -> Namespace:
+    """Settings with the fields for which their options stand."""
+    found = settings.clone()
+    given = {name: own for name, own in OPTIONS.items() if found.get(name, own.default) != own.default}
+    for own in given.values():
+        own.apply(found)
+    for name, own in given.items():
+        found[name] = own.default
+    return found
 
 
 def config_text(parser: ArgumentParser, settings: Namespace) -> str:
     """The settings that determine the result, as YAML."""
     kept = settings.clone()
-    for name in (*RUN_ONLY, *(name for name in CUSTOM if kept.get(name) is None)):
+    for name in (*RUN_ONLY, *OPTIONS, *(name for name in CUSTOM if kept.get(name) is None)):
         kept.pop(name, None)
     return str(parser.dump(kept, skip_validation=True))
 

@@ -19,7 +19,7 @@ from gaussian_swaying._yaml_limits import read_fields
 from gaussian_swaying.config.parser import check_settings, import_forces, option
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.simulation.measure import SimulationDiverged
-from gaussian_swaying.simulation.model import Model, find, flow_of, names, number
+from gaussian_swaying.simulation.model import Live, Model, find, flow_of, names, number
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.simulation.step import Stepper, why_not_batched
 from gaussian_swaying.wind.field import WindField
@@ -69,15 +69,25 @@ def at_scale(model: Model, metres_per_unit: float) -> Model:
 SCALES = ("log", "linear")
 FILM_START = "film.start"
 """Time in the film at which the motion starts, at rest until then [s]; below 0, the wind has blown for so long when the
-film begins. It is no number of the simulation."""
+film begins."""
 
-CHANGES = ("wind.speed@", "wind.azimuth@")
-"""Begins of the names of the wind at a time of the film, see :mod:`~gaussian_swaying.fitting.unknowns`."""
+OF_FILM = {
+    FILM_START: Live("s"),
+    SCALE: Live("m", scale="log"),
+    "wind.speed@": Live(low=0.2, high=5.0, scale="log"),
+    "wind.azimuth@": Live("degrees", -90.0, 90.0),
+}
+"""Unknowns that are no numbers of the simulation. A time of the film follows the ``@`` of a wind that changes."""
 
 
 def is_change(name: str) -> bool:
-    """True for an unknown of a wind that changes: no number of the simulation."""
-    return name.startswith(CHANGES)
+    """True for an unknown of a wind that changes."""
+    return "@" in name
+
+
+def known_unknown(name: str) -> Live | None:
+    """The number of an unknown; None if there is none."""
+    return OF_FILM.get(name[: name.find("@") + 1] or name) or find(name)
 
 
 @dataclass(frozen=True)
@@ -106,28 +116,24 @@ class Unknown:
     def __post_init__(self) -> None:
         where = f"unknowns.{self.name}"
         check_choice(f"{where}.scale", self.scale, SCALES)
-        known = find(self.name)
-        own = self.name in (FILM_START, SCALE) or is_change(self.name)
-        if not own and (known is None or known.kind != "number"):
-            numbers = (name for name in names() if number(name.replace("*", "0")).kind == "number")
-            sought = [FILM_START, SCALE, *numbers]
+        known = known_unknown(self.name)
+        if known is None or known.kind != "number":
+            possible = {n: known_unknown(n.replace("*", "0")) for n in (FILM_START, SCALE, *names())}
+            sought = [n for n, one in possible.items() if one and one.kind == "number"]
             raise ValueError(f"`{self.name}` cannot be sought: use {', '.join(sought)}, or put it into `known`.")
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
             raise ValueError(f"Expected `{where}.range` to be [low, high], but got [{self.low}, {self.high}].")
         if self.scale == "log" and self.low <= 0:
             raise ValueError(f"Expected `{where}.range` above 0 with `scale: log`, but got {self.low}.")
-        if known is not None:
-            known.check(f"{where}.range", self.low)
-            known.check(f"{where}.range", self.high)
+        known.check(f"{where}.range", self.low)
+        known.check(f"{where}.range", self.high)
         if self.start is not None and not self.low <= self.start <= self.high:
             raise ValueError(f"Expected `{where}.start` within its range, but got {self.start}.")
 
     @property
     def unit(self) -> str:
-        if is_change(self.name):
-            return "" if self.name.startswith(CHANGES[0]) else "degrees"
-        own = {FILM_START: "s", SCALE: "m"}
-        return own[self.name] if self.name in own else number(self.name).unit
+        known = known_unknown(self.name)
+        return known.unit if known else ""
 
     def value(self, share: float) -> float:
         """The value at a share of the range, 0 at ``low`` and 1 at ``high``."""
@@ -148,13 +154,13 @@ class Unknown:
 
 def of_simulation(values: Mapping[str, float]) -> dict[str, float]:
     """The values that are numbers of the simulation."""
-    return {n: value for n, value in values.items() if n not in (FILM_START, SCALE) and not is_change(n)}
+    return {n: value for n, value in values.items() if n not in OF_FILM and not is_change(n)}
 
 
 def default_scale(name: str, low: float) -> str:
     """``log`` for positive sizes, ``linear`` for angles, Poisson's ratio and ranges that reach zero."""
-    known = find(name)
-    return "log" if low > 0 and name != FILM_START and (known is None or known.scale == "log") else "linear"
+    known = known_unknown(name)
+    return "log" if low > 0 and known and known.scale == "log" else "linear"
 
 
 def values_at(unknowns: Sequence[Unknown], place: Iterable[float]) -> dict[str, float]:
@@ -185,18 +191,16 @@ WALK = {"wind.speed@": 0.5, "wind.azimuth@": 20.0}
 PRIOR = "prior"
 """Kind of the residuals of the prior, which are in standard deviations."""
 
-RANGES = {"wind.speed@": (0.2, 5.0, "log"), "wind.azimuth@": (-90.0, 90.0, "linear")}
-
 
 def changes_of(unknowns: Sequence[Unknown], until: float) -> list[Unknown]:
     """The unknowns of a wind that changes until a time of the film [s], beside some that are sought already.
 
     The azimuth changes only where it is sought.
     """
-    sought = [kind for kind in CHANGES if kind[:-1] in {u.name for u in unknowns}]
+    sought = {kind: OF_FILM[kind] for kind in WALK if kind[:-1] in {u.name for u in unknowns}}
     count = max(KNOTS, math.ceil(until / EVERY))
     times = [until * (k + 1) / count for k in range(count)]
-    return [Unknown(f"{kind}{time:.4g}", *RANGES[kind]) for kind in sought for time in times]
+    return [Unknown(f"{kind}{time:.4g}", n.low, n.high, n.scale) for kind, n in sought.items() for time in times]
 
 
 def steady_share(unknown: Unknown) -> float:
@@ -332,7 +336,7 @@ def gusts_of(unknowns: Sequence[Unknown], place: Sequence[float], covariance: Te
         covariance: Covariance of the shares, shape (U, U).
     """
     names = [u.name for u in unknowns]
-    knots = sorted((float(name.split("@")[1]), k) for k, name in enumerate(names) if name.startswith(CHANGES[0]))
+    knots = sorted((float(name.split("@")[1]), k) for k, name in enumerate(names) if name.startswith("wind.speed@"))
     if not knots or "wind.speed" not in names:
         return None
     first = names.index("wind.speed")
@@ -592,7 +596,7 @@ def _groups(simulation: Simulation, values: Sequence[Values], models: Sequence[M
         apart = [
             (name, value)
             for name, value in sorted(own.items())
-            if name in (FILM_START, SCALE) or not (is_change(name) or number(name).batched)
+            if not (is_change(name) or (name not in OF_FILM and number(name).batched))
         ]
         shared.setdefault((*apart, 0 if alike else _stiffness_class(model)), []).append(index)
     found = []

@@ -46,7 +46,7 @@ def read_splat(path: str | os.PathLike[str]) -> GaussianCloud:
 
 
 def read_compressed_ply(path: str | os.PathLike[str]) -> GaussianCloud:
-    """Read a compressed .ply, as SuperSplat and :func:`~gaussian_swaying.gaussians.export.export_cloud` write it.
+    """Read a compressed .ply, as SuperSplat and :func:`~gaussian_swaying.gaussians.formats.export_cloud` write it.
 
     Each chunk of 256 Gaussians has ranges for centres, sizes and, in newer files, colours; within them centres and
     sizes have 11, 10 and 11 bits, colours and opacities 8. Quaternions store their three smaller components with 10

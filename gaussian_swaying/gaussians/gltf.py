@@ -69,7 +69,7 @@ def encode_gltf(cloud: GaussianCloud, rotation: Tensor | None = None, metres_per
     Programs that do not know the extension show points in the colours of degree 0.
 
     Args:
-        cloud: The Gaussians, finite (see :func:`~gaussian_swaying.gaussians.export.cleaned`).
+        cloud: The Gaussians, finite (see :func:`~gaussian_swaying.gaussians.formats.cleaned`).
         rotation: Rotation from scene directions to z up, shape (3, 3); the scene's z is up if None.
         metres_per_unit: Length of a scene unit [m].
 

@@ -14,7 +14,6 @@ from gaussian_swaying._checks import check_choice, check_shape
 from gaussian_swaying._fixed import Fixed, fixed
 from gaussian_swaying.gaussians.area import coverage_area, patch_area
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.harmonics import rotate_sh, sh_to_color
 from gaussian_swaying.gaussians.openness import openness
 from gaussian_swaying.gaussians.ply import write_ply
@@ -123,11 +122,6 @@ class GaussianSurfaceModel(Fixed, nn.Module):
     def from_cloud(cls, cloud: GaussianCloud, requires_grad: bool = True, *, copy: bool = True) -> GaussianSurfaceModel:
         """The model of given Gaussians."""
         return cls(cloud, requires_grad, copy=copy)
-
-    @classmethod
-    def from_ply(cls, path: str | os.PathLike[str], requires_grad: bool = True) -> GaussianSurfaceModel:
-        """The model of a file that :func:`~gaussian_swaying.gaussians.formats.read_gaussians` reads."""
-        return cls(read_gaussians(path), requires_grad)
 
     def to_cloud(self) -> GaussianCloud:
         """The Gaussians in storage form, detached; they share memory with the parameters except for ``sh``."""

@@ -66,7 +66,7 @@ def encode_sog(cloud: GaussianCloud) -> bytes:
     Up to 65,536 different sets of harmonics beyond degree 0 are kept; where there are more, similar ones are averaged.
 
     Args:
-        cloud: The Gaussians, finite (see :func:`~gaussian_swaying.gaussians.export.cleaned`).
+        cloud: The Gaussians, finite (see :func:`~gaussian_swaying.gaussians.formats.cleaned`).
 
     Returns:
         The content of the file.

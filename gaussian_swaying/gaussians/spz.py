@@ -81,44 +81,44 @@ def read_spz(path: str | os.PathLike[str]) -> GaussianCloud:
     )
 
 
-def encode_spz(cloud: GaussianCloud, version: int = 3) -> bytes:
+def encode_spz(cloud: GaussianCloud, spz_version: int = 3) -> bytes:
     """An .spz file.
 
     Centres have 24 bits, as many of them behind the binary point as the largest coordinate allows, up to 24. Sizes lie
     between 4.5e-5 and 380 scene units, in steps of 6 %. Harmonics have 5 bits in band 1 and 4 above.
 
     Args:
-        cloud: The Gaussians, finite (see :func:`~gaussian_swaying.gaussians.export.cleaned`).
-        version: 3 is read by most programs; 4 needs zstandard; 1 and 2 have coarser rotations, and 1 centres in half
-            precision.
+        cloud: The Gaussians, finite (see :func:`~gaussian_swaying.gaussians.formats.cleaned`).
+        spz_version: 3 is read by most programs; 4 needs zstandard; 1 and 2 have coarser rotations, and 1 centres in
+            half precision.
 
     Returns:
         The content of the file.
     """
-    if version not in VERSIONS:
-        raise ValueError(f"Expected `spz_version` to be 1, 2, 3 or 4, but got {version}.")
-    compress = _zstandard().ZstdCompressor(level=12).compress if version == 4 else None
+    if spz_version not in VERSIONS:
+        raise ValueError(f"Expected `spz_version` to be 1, 2, 3 or 4, but got {spz_version}.")
+    compress = _zstandard().ZstdCompressor(level=12).compress if spz_version == 4 else None
     means, quats, scales, opacities, sh = (
         floats(part) for part in (cloud.means, cloud.quats, cloud.scales, cloud.opacities, cloud.sh)
     )
     farthest = float(np.abs(means).max(initial=0.0))
-    if farthest >= (65504 if version == 1 else 2**23 - 1):
+    if farthest >= (65504 if spz_version == 1 else 2**23 - 1):
         raise ValueError(
             f"An .spz file holds centres up to ±8e6 (version 1: ±65504) but one is at {farthest:g}: remove what is far "
             "away, or choose another format."
         )
     fraction = fraction_bits(farthest)
     parts = (
-        means.astype("<f2") if version == 1 else _int24(means * np.float64(2.0**fraction)),
+        means.astype("<f2") if spz_version == 1 else _int24(means * np.float64(2.0**fraction)),
         _byte(255 / (1 + np.exp(-opacities))),
         _byte(sh[:, 0] * COLOR_SCALE * 255 + 127.5),
         _byte((scales + 10) * 16),
-        _to_three(quats) if version < 3 else _to_smallest(quats),
+        _to_three(quats) if spz_version < 3 else _to_smallest(quats),
         np.concatenate([_coarse(sh[:, 1:4], _BITS[0]), _coarse(sh[:, 4:], _BITS[1])], axis=1),
     )
     packed = [part.tobytes() for part in parts if part.size]
-    streams = len(packed) if version == 4 else 0
-    head = _HEAD.pack(_MAGIC, version, len(cloud), cloud.sh_degree, fraction, 0, streams)
+    streams = len(packed) if spz_version == 4 else 0
+    head = _HEAD.pack(_MAGIC, spz_version, len(cloud), cloud.sh_degree, fraction, 0, streams)
     if compress is None:
         return gzip.compress(head + b"".join(packed), compresslevel=6, mtime=0)
     small = [compress(part) for part in packed]

@@ -5,26 +5,23 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-# names that a run writes; a folder that was not made by a run must not contain them
-OURS = [
-    "run.json",
-    "config.yaml",
-    "checkpoint.pt",
-    "trajectory.npz",
-    "nodes.npz",
-    "summary.json",
-    "diagnostics.csv",
-]
-OURS += ["frames", "trajectory", "nodes", "video.mp4", "cameras", "depth", "depth_raw", "normal", "force"]
-OURS += ["wind", "wind.mp4"]
-OURS += ["depth.mp4", "normal.mp4", "force.mp4", "film.html"]
+from gaussian_swaying.rendering.passes import PASSES
+
+_FILES = ["run.json", "config.yaml", "checkpoint.pt", "summary.json", "diagnostics.csv", "film.html", "cameras"]
+_FILES += ["trajectory", "nodes", "trajectory.npz", "nodes.npz"]
+
+
+def names() -> list[str]:
+    """Names that a run writes; a folder that was not made by a run must not contain them."""
+    places = map(frame_folder, PASSES)
+    return _FILES + [name for place in places for name in (place, raw_folder(place), video_file(place))]
 
 
 def frame_folder(render: str = "color", camera: str = "") -> str:
     """Folder of a render's frames inside that of the run: ``frames``, ``depth``, ``cameras/<name>/frames`` ...
 
     Args:
-        render: One of ``color``, ``depth``, ``normal``, ``force`` and ``wind``.
+        render: The name of a pass.
         camera: Name of a further camera; empty for the main camera.
     """
     own = "frames" if render == "color" else render

@@ -22,7 +22,7 @@ from gaussian_swaying._checks import check_choice, check_positive
 from gaussian_swaying._files import atomic, is_blank, remove_temporaries, save_png, write_json, write_table, write_text
 from gaussian_swaying._fixed import fixed
 from gaussian_swaying.recording.checkpoint import read_checkpoint
-from gaussian_swaying.recording.layout import OURS, frame_folder, raw_folder, video_file
+from gaussian_swaying.recording.layout import frame_folder, names, raw_folder, video_file
 from gaussian_swaying.recording.nodes import NODES, split_far
 from gaussian_swaying.recording.resume import packed_frames, tell_missing
 from gaussian_swaying.recording.trajectory import pack_trajectory
@@ -116,7 +116,7 @@ class Recorder:
                 f"{renders!r}."
             )
         for render in renders:
-            check_choice("recorder.renders", render, PASSES)
+            check_choice("recorder.renders", render, tuple(PASSES))
         if self.video and not self.images:
             raise ValueError("The video is made from the images: set `recorder.images` to true or `video` to false.")
         self._folder: Path | None = None
@@ -193,7 +193,7 @@ class Recorder:
         try:
             checkpoint = self._continue(path, config, check) if resume else None
             if not resume:
-                self._lock = claim_folder(path, OURS, "choose another with --output")
+                self._lock = claim_folder(path, names(), "choose another with --output")
             self._folder = path
             try:
                 self._make_folders()
@@ -256,7 +256,7 @@ class Recorder:
             (self.folder / name).mkdir(parents=True, exist_ok=True)
 
     def _picture_folders(self) -> list[str]:
-        raw = [raw_folder(place) for place in self._films if Path(place).name == "depth"]
+        raw = [raw_folder(place) for place in self._films if (own := PASSES.get(Path(place).name)) and own.raw]
         return [*self._films, *raw]
 
     def write_image(self, index: int, image: Tensor, place: str = "frames") -> None:
@@ -302,8 +302,8 @@ class Recorder:
             for place, frames in sorted(found.items())
         ]
 
-    def write_depth(self, index: int, steps: Tensor, place: str = "depth") -> None:
-        """Write one frame's depth as 16-bit PNG, beside the frames of ``place``.
+    def write_raw(self, index: int, steps: Tensor, place: str) -> None:
+        """Write one frame's numbers as 16-bit PNG, beside the frames of ``place``.
 
         Args:
             index: Frame number.

@@ -6,13 +6,16 @@ covered by less than half has no value.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_shape
 from gaussian_swaying.rendering.protocol import RenderOutput
 
-PASSES = ("color", "depth", "normal", "force", "wind", "vorticity")
 COVERED = 0.5
 """Smallest opacity of a pixel with a depth, a normal or a force."""
 MAX_STEPS = 65535
@@ -38,7 +41,7 @@ def depth_steps(depth: Tensor) -> Tensor:
     return torch.where(depth > 0, steps, 0.0).int()
 
 
-def depth_colors(depth: Tensor, near: float, far: float) -> Tensor:
+def depth_colors(depth: Tensor, near: float | Tensor, far: float | Tensor) -> Tensor:
     """Colours of a depth: yellow up to ``near``, violet from ``far`` on, black for empty pixels.
 
     Args:
@@ -130,3 +133,35 @@ def colormap(values: Tensor) -> Tensor:
     place = values.nan_to_num(0.0).clamp(0, 1) * (len(_VIRIDIS) - 1)
     low = place.floor().clamp(max=len(_VIRIDIS) - 2)
     return torch.lerp(table[low.long()], table[low.long() + 1], (place - low)[..., None])
+
+
+@dataclass(frozen=True)
+class Pass:
+    """A picture of each frame that a run can record.
+
+    Args:
+        draw: Makes its colours, shape (H, W, 3), of a :class:`~gaussian_swaying.simulation.draw.View`.
+        raw: Makes 16-bit numbers, int32, shape (H, W), which are recorded as well.
+        alone: Whether it shows the Gaussians alone, so that it suits copies, and a motion that closes.
+        air: Whether only a simulation with computed air has it.
+    """
+
+    draw: Callable[[Any], Tensor]
+    raw: Callable[[Any], Tensor] | None = None
+    alone: bool = False
+    air: bool = False
+
+
+PASSES = {
+    "color": Pass(lambda view: view.picture.color, alone=True),
+    "depth": Pass(
+        lambda view: depth_colors(mean_depth(view.picture), *view.depth_range),
+        lambda view: depth_steps(mean_depth(view.picture) * view.painter.scene.frame.metres_per_unit),
+        alone=True,
+    ),
+    "normal": Pass(lambda view: view.normals(), alone=True),
+    "force": Pass(lambda view: view.pressure()),
+    "wind": Pass(lambda view: view.wind()),
+    "vorticity": Pass(lambda view: view.vorticity(), air=True),
+}
+"""All passes by their names; another entry can be recorded and shown like them."""

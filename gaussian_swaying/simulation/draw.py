@@ -18,7 +18,7 @@ from gaussian_swaying._devices import in_double
 from gaussian_swaying._files import atomic, is_blank, save_png
 from gaussian_swaying._fixed import Fixed, fixed
 from gaussian_swaying._turns import Turn, in_turn
-from gaussian_swaying.gaussians.export import export_cloud
+from gaussian_swaying.gaussians.formats import export_cloud
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.gaussians.ply import check_folder
@@ -270,57 +270,9 @@ class Painter(Fixed, nn.Module):
         """The picture of Gaussians in scene units with their own colours, from a camera on their device."""
         return self.draw(gaussians, self.colors(gaussians, camera), camera)
 
-    def draw_normals(
-        self, gaussians: DeformedGaussians, camera: Camera, axes: str = "camera", smooth: bool = False
-    ) -> Tensor:
-        """Picture of the normals, see :func:`~gaussian_swaying.rendering.passes.normal_colors`, shape (H, W, 3).
-
-        Args:
-            gaussians: In scene units.
-            camera: The camera, on the device of the Gaussians.
-            axes: ``camera`` (x right, y up, z towards the camera) or ``world`` (z up).
-            smooth: Whether edges fade to black instead of ending at a pixel.
-        """
-        normals = passes.facing(gaussians.normals, gaussians.means - camera.position.to(gaussians.means))
-        picture = self._draw(gaussians, normals, camera)
-        if axes == "world":
-            rotation = self.scene.frame.direction_to_sim(self.scene.identity).mT  # its rows are the scene's axes
-        else:
-            rotation = torch.cat([camera.world_to_camera[:1, :3], -camera.world_to_camera[1:3, :3]])
-        return passes.normal_colors(picture.color, picture.alpha, rotation, smooth)
-
-    def draw_pressure(
-        self,
-        pressure: Tensor,
-        gaussians: DeformedGaussians,
-        camera: Camera,
-        largest: float,
-        smooth: bool = False,
-    ) -> Tensor:
-        """Picture of a force per area, with a colour scale that ends at ``largest`` [Pa], shape (H, W, 3).
-
-        Args:
-            pressure: Force per area of each Gaussian [Pa], shape (N,).
-            gaussians: In scene units.
-            camera: The camera, on the device of the Gaussians.
-            largest: End of the colour scale [Pa].
-            smooth: Whether edges fade to black instead of ending at a pixel.
-        """
-        shown = pressure.to(gaussians.means)
-        picture = self._draw(gaussians, shown[:, None].expand(-1, 3), camera)
-        return passes.scalar_colors(picture.color[..., 0], picture.alpha, largest, smooth)
-
-    def _draw(self, gaussians: DeformedGaussians, values: Tensor, camera: Camera) -> RenderOutput:
-        return self.renderer(gaussians.means, gaussians.covariances, self.opacity(), values, camera)
-
     def opacity(self) -> Tensor:
         """Opacities of the Gaussians that are drawn, shape (N,)."""
         return self.scene.model.opacity()
-
-    def depth_range(self, frame: int, name: str) -> tuple[float, float]:
-        """Ends of the depth's colour scale [scene units]: one longest side before and behind the object's centre."""
-        distance = float((self._camera(frame, name).position.to(self.center) - self.center).norm())
-        return distance - self.size, distance + self.size
 
 
 def draw(
@@ -529,98 +481,140 @@ def speed_scale(stepper: Stepper) -> float:
     return 1.5 * float(torch.linalg.vector_norm(stepper.flows(), dim=-1).amax())
 
 
-def draw_wind(
-    stepper: Stepper, state: State, camera: Camera, picture: RenderOutput, largest: float | None = None
-) -> Tensor:
-    """The picture of the object, paler, with streaks of air over it, from violet in still air to yellow.
-
-    A streak is hidden where the object is in front of it, and fades towards its tail.
+@dataclass(frozen=True, eq=False)
+class View:
+    """A moment of a simulation as a camera sees it: what a pass draws.
 
     Args:
-        stepper: The stepper of the simulation.
+        painter: Draws the scene; it has the stepper.
         state: The state.
-        camera: The camera, on the device of the Gaussians.
-        picture: Picture of the object from the camera.
-        largest: End of the colour scale [m/s]; 1.5 times the mean flow if None.
-
-    Returns:
-        Shape (H, W, 3), on the CPU.
+        gaussians: Its Gaussians, in scene units.
+        camera: The camera, on their device.
+        colors: Their colours from there, shape (N, 3); those of the painter if None.
+        live: Whether it is for the live page: edges fade to black instead of ending at a pixel, and normals are in
+            world axes (z up) instead of those of the camera (x right, y up, z towards it).
+        force_end: End of the colour scale of forces [Pa].
     """
-    from PIL import Image, ImageChops, ImageDraw
 
-    places, speeds = (part.cpu() for part in streaks(stepper, state, camera))
-    largest = largest or speed_scale(stepper) or float(speeds.amax()) or 1.0
-    pixel, depth = project(places.reshape(-1, 3), camera)
-    pixel, depth = pixel.view(*speeds.shape, 2), depth.view_as(speeds)
-    row, column = (pixel[..., k].nan_to_num(-1).clamp(-1, 1e6).floor().long() for k in (1, 0))
-    shown = (depth > 1e-3) & (row >= 0) & (row < camera.height) & (column >= 0) & (column < camera.width)
-    behind = row.clamp(0, camera.height - 1) * camera.width + column.clamp(0, camera.width - 1)
-    front = mean_depth(picture).reshape(-1)[behind.to(picture.color.device)].to(depth)
-    hidden = (front > 0) & (front < depth)
-    colours = (255 * colormap(speeds / largest)).tolist()
-    ratio = 2  # drawn larger and reduced, so that the lines are smooth
-    size = (camera.width * ratio, camera.height * ratio)
-    cover, layer = Image.new("L", size), Image.new("RGB", size)  # opacity, and colour times opacity
-    cover_pen, layer_pen = ImageDraw.Draw(cover), ImageDraw.Draw(layer)
-    thick = max(3, round(0.009 * camera.height * ratio))
-    points, visible = (ratio * pixel).tolist(), (shown & ~hidden).tolist()
-    for streak, colour, known in zip(points, colours, visible, strict=True):
-        for k in range(STEPS):
-            if known[k] and known[k + 1]:
-                share = (k + 1) / STEPS
-                ends, width = [tuple(streak[k]), tuple(streak[k + 1])], max(1, round(thick * (0.35 + 0.65 * share)))
-                opacity = round(40 + 215 * share)
-                cover_pen.line(ends, fill=opacity, width=width)
-                layer_pen.line(ends, fill=tuple(round(c * opacity / 255) for c in colour[k]), width=width)
-        if known[STEPS]:
-            (x, y), r = streak[STEPS], 0.75 * thick
-            cover_pen.ellipse([x - r, y - r, x + r, y + r], fill=255)
-            layer_pen.ellipse([x - r, y - r, x + r, y + r], fill=tuple(round(c) for c in colour[STEPS]))
-    paler = (191.25 * picture.color.detach().float().clamp(0, 1) + 63.75).round().to(torch.uint8).cpu()
-    clear = ImageChops.invert(cover.reduce(ratio))
-    seen = ImageChops.multiply(Image.fromarray(paler.numpy()), Image.merge("RGB", [clear] * 3))
-    over = ImageChops.add(seen, layer.reduce(ratio))
-    return torch.frombuffer(bytearray(over.tobytes()), dtype=torch.uint8).view(camera.height, camera.width, 3) / 255
+    painter: Painter
+    state: State
+    gaussians: DeformedGaussians
+    camera: Camera
+    colors: Tensor | None = None
+    live: bool = False
+    force_end: float = 1.0
 
+    @cached_property
+    def picture(self) -> RenderOutput:
+        """The picture in colour."""
+        colors = self.painter.colors(self.gaussians, self.camera) if self.colors is None else self.colors
+        return self.painter.draw(self.gaussians, colors, self.camera)
 
-def draw_vorticity(stepper: Stepper, state: State, camera: Camera, picture: RenderOutput) -> Tensor:
-    """The picture of the object, paler, with the vorticity of computed air in the plane of the streaks.
+    @property
+    def depth_range(self) -> tuple[Tensor, Tensor]:
+        """Ends of the depth's colour scale [scene units]: one longest side before and behind the object's centre."""
+        center, size = self.painter.center, self.painter.size
+        distance = torch.linalg.vector_norm(self.camera.position.to(center) - center)
+        return distance - size, distance + size
 
-    Its part across the plane is drawn: blue turns clockwise as the camera sees it, red the other way, in full colour
-    from eight times the flow per longest side of the object on. The object hides what is behind it.
+    def blend(self, values: Tensor) -> RenderOutput:
+        """Three values of each Gaussian, shape (N, 3), blended like colours over zero."""
+        painter, own = self.painter, self.gaussians
+        return painter.renderer(own.means, own.covariances, painter.opacity(), values, self.camera)
 
-    Args:
-        stepper: The stepper of the simulation, with computed air.
-        state: The state.
-        camera: The camera, on the device of the Gaussians.
-        picture: Picture of the object from the camera.
+    def scalar(self, values: Tensor, largest: float) -> Tensor:
+        """Picture of a value of each Gaussian, shape (N,), from violet at 0 to yellow at the largest: (H, W, 3)."""
+        blended = self.blend(values.to(self.gaussians.means)[:, None].expand(-1, 3))
+        return passes.scalar_colors(blended.color[..., 0], blended.alpha, largest, self.live)
 
-    Returns:
-        Shape (H, W, 3), on the CPU.
-    """
-    air, frame, moments = stepper.air, stepper.scene.frame, state.air
-    assert air is not None
-    assert moments is not None
-    mean, centre, eye = (part.cpu() for part in _middle(stepper, state, camera))
-    axis = torch.linalg.cross(*_plane(mean, (centre - eye) / (centre - eye).norm()))
-    axis = axis if float((axis * (eye - centre)).sum()) > 0 else -axis  # towards the camera
-    view, intrinsics = camera.world_to_camera.cpu().double(), camera.intrinsics.cpu().double()
-    row, column = torch.meshgrid(
-        *(torch.arange(n, dtype=torch.float64) + 0.5 for n in (camera.height, camera.width)), indexing="ij"
-    )
-    x, y = (column - intrinsics[0, 2]) / intrinsics[0, 0], (row - intrinsics[1, 2]) / intrinsics[1, 1]
-    ways = torch.stack([x, y, torch.ones_like(x)], -1) @ view[:3, :3]  # a depth of one along each ray, scene units
-    ways = frame.point_to_sim((camera.position.cpu().double() + ways).reshape(-1, 3)).view_as(ways) - eye
-    depth = ((centre - eye) * axis).sum() / (ways * axis).sum(-1)
-    place = (eye + depth.clamp(0, 1e6).nan_to_num(0.0)[..., None] * ways).reshape(-1, 3)
-    turning = air.vorticity_at(moments, place.to(state.position)).cpu().double() @ axis
-    size = float((state.position.amax(0) - state.position.amin(0)).amax())
-    share = turning.view_as(depth) * size / (8 * max(float(mean.norm()), 1e-6))
-    seen = mean_depth(picture).cpu()
-    alpha = (share.abs().clamp(max=1) * (depth > 0) * ~((seen > 0) & (seen < depth)))[..., None].float()
-    colours = torch.where(share[..., None] > 0, torch.tensor([0.70, 0.09, 0.17]), torch.tensor([0.13, 0.40, 0.67]))
-    under = 0.5 * picture.color.detach().cpu().float().clamp(0, 1) + 0.5
-    return under * (1 - alpha) + colours * alpha
+    def normals(self) -> Tensor:
+        """Picture of the normals, see :func:`~gaussian_swaying.rendering.passes.normal_colors`, shape (H, W, 3)."""
+        own, camera = self.gaussians, self.camera
+        blended = self.blend(passes.facing(own.normals, own.means - camera.position.to(own.means)))
+        if self.live:
+            scene = self.painter.scene
+            rotation = scene.frame.direction_to_sim(scene.identity).mT  # its rows are the scene's axes
+        else:
+            rotation = torch.cat([camera.world_to_camera[:1, :3], -camera.world_to_camera[1:3, :3]])
+        return passes.normal_colors(blended.color, blended.alpha, rotation, self.live)
+
+    def pressure(self) -> Tensor:
+        """Picture of the force of the wind per area, shape (H, W, 3)."""
+        return self.scalar(self.painter.stepper.wind_pressure(self.state), self.force_end)
+
+    def wind(self) -> Tensor:
+        """The picture in colour, paler, with streaks of air over it, from violet in still air to yellow.
+
+        A streak is hidden where the object is in front of it, and fades towards its tail. Shape (H, W, 3), on the CPU.
+        """
+        from PIL import Image, ImageChops, ImageDraw
+
+        stepper, camera, picture = self.painter.stepper, self.camera, self.picture
+        places, speeds = (part.cpu() for part in streaks(stepper, self.state, camera))
+        largest = speed_scale(stepper) or float(speeds.amax()) or 1.0
+        pixel, depth = project(places.reshape(-1, 3), camera)
+        pixel, depth = pixel.view(*speeds.shape, 2), depth.view_as(speeds)
+        row, column = (pixel[..., k].nan_to_num(-1).clamp(-1, 1e6).floor().long() for k in (1, 0))
+        shown = (depth > 1e-3) & (row >= 0) & (row < camera.height) & (column >= 0) & (column < camera.width)
+        behind = row.clamp(0, camera.height - 1) * camera.width + column.clamp(0, camera.width - 1)
+        front = mean_depth(picture).reshape(-1)[behind.to(picture.color.device)].to(depth)
+        hidden = (front > 0) & (front < depth)
+        colours = (255 * colormap(speeds / largest)).tolist()
+        ratio = 2  # drawn larger and reduced, so that the lines are smooth
+        size = (camera.width * ratio, camera.height * ratio)
+        cover, layer = Image.new("L", size), Image.new("RGB", size)  # opacity, and colour times opacity
+        cover_pen, layer_pen = ImageDraw.Draw(cover), ImageDraw.Draw(layer)
+        thick = max(3, round(0.009 * camera.height * ratio))
+        points, visible = (ratio * pixel).tolist(), (shown & ~hidden).tolist()
+        for streak, colour, known in zip(points, colours, visible, strict=True):
+            for k in range(STEPS):
+                if known[k] and known[k + 1]:
+                    share = (k + 1) / STEPS
+                    ends, width = [tuple(streak[k]), tuple(streak[k + 1])], max(1, round(thick * (0.35 + 0.65 * share)))
+                    opacity = round(40 + 215 * share)
+                    cover_pen.line(ends, fill=opacity, width=width)
+                    layer_pen.line(ends, fill=tuple(round(c * opacity / 255) for c in colour[k]), width=width)
+            if known[STEPS]:
+                (x, y), r = streak[STEPS], 0.75 * thick
+                cover_pen.ellipse([x - r, y - r, x + r, y + r], fill=255)
+                layer_pen.ellipse([x - r, y - r, x + r, y + r], fill=tuple(round(c) for c in colour[STEPS]))
+        paler = (191.25 * picture.color.detach().float().clamp(0, 1) + 63.75).round().to(torch.uint8).cpu()
+        clear = ImageChops.invert(cover.reduce(ratio))
+        seen = ImageChops.multiply(Image.fromarray(paler.numpy()), Image.merge("RGB", [clear] * 3))
+        over = ImageChops.add(seen, layer.reduce(ratio))
+        return torch.frombuffer(bytearray(over.tobytes()), dtype=torch.uint8).view(camera.height, camera.width, 3) / 255
+
+    def vorticity(self) -> Tensor:
+        """The picture in colour, paler, with the vorticity of computed air in the plane of the streaks.
+
+        Its part across the plane is drawn: blue turns clockwise as the camera sees it, red the other way, in full
+        colour from eight times the flow per longest side of the object on. The object hides what is behind it. Shape
+        (H, W, 3), on the CPU.
+        """
+        stepper, state, camera = self.painter.stepper, self.state, self.camera
+        air, frame, moments = stepper.air, stepper.scene.frame, state.air
+        assert air is not None
+        assert moments is not None
+        mean, centre, eye = (part.cpu() for part in _middle(stepper, state, camera))
+        axis = torch.linalg.cross(*_plane(mean, (centre - eye) / (centre - eye).norm()))
+        axis = axis if float((axis * (eye - centre)).sum()) > 0 else -axis  # towards the camera
+        view, intrinsics = camera.world_to_camera.cpu().double(), camera.intrinsics.cpu().double()
+        row, column = torch.meshgrid(
+            *(torch.arange(n, dtype=torch.float64) + 0.5 for n in (camera.height, camera.width)), indexing="ij"
+        )
+        x, y = (column - intrinsics[0, 2]) / intrinsics[0, 0], (row - intrinsics[1, 2]) / intrinsics[1, 1]
+        ways = torch.stack([x, y, torch.ones_like(x)], -1) @ view[:3, :3]  # a depth of one along each ray, scene units
+        ways = frame.point_to_sim((camera.position.cpu().double() + ways).reshape(-1, 3)).view_as(ways) - eye
+        depth = ((centre - eye) * axis).sum() / (ways * axis).sum(-1)
+        place = (eye + depth.clamp(0, 1e6).nan_to_num(0.0)[..., None] * ways).reshape(-1, 3)
+        turning = air.vorticity_at(moments, place.to(state.position)).cpu().double() @ axis
+        size = float((state.position.amax(0) - state.position.amin(0)).amax())
+        share = turning.view_as(depth) * size / (8 * max(float(mean.norm()), 1e-6))
+        seen = mean_depth(self.picture).cpu()
+        alpha = (share.abs().clamp(max=1) * (depth > 0) * ~((seen > 0) & (seen < depth)))[..., None].float()
+        colours = torch.where(share[..., None] > 0, torch.tensor([0.70, 0.09, 0.17]), torch.tensor([0.13, 0.40, 0.67]))
+        under = 0.5 * self.picture.color.detach().cpu().float().clamp(0, 1) + 0.5
+        return under * (1 - alpha) + colours * alpha
 
 
 @fixed
@@ -688,8 +682,7 @@ class Frame:
 
         Args:
             path: File to write, such as 0001.ply or 0001.png; an existing one is replaced.
-            format: As in :func:`~gaussian_swaying.gaussians.export.export_cloud`; by default that of the ending: .ply,
-                .compressed.ply, .splat, .spz, .sog, .glb, or .usdc, .usd and .usda.
+            format: As in :func:`~gaussian_swaying.gaussians.formats.export_cloud`; by default that of the ending.
 
         Raises:
             FileNotFoundError: If the folder does not exist.

@@ -19,10 +19,10 @@ from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.recording.checkpoint import log_lines
 from gaussian_swaying.recording.recorder import Recorder, frame_folder
-from gaussian_swaying.rendering import passes
+from gaussian_swaying.rendering.passes import PASSES
 from gaussian_swaying.runs import signals
 from gaussian_swaying.simulation.body import SimulatedScene, coarse, narrow
-from gaussian_swaying.simulation.draw import Painter, draw_vorticity, draw_wind, frames_from
+from gaussian_swaying.simulation.draw import Painter, View, frames_from
 from gaussian_swaying.simulation.measure import RunProgress, SimulationDiverged, advice, extremes
 from gaussian_swaying.simulation.step import SceneEditor, Stepper, check_recorder
 
@@ -152,10 +152,9 @@ class Closing:
                 f"`recorder.loop` of {recorder.loop:g} s is {self.count} frames, and the run has {frames}: raise "
                 f"`frames` to more than {2 * self.count}, or shorten `recorder.loop`."
             )
-        if self.count and not {"color", "depth", "normal"}.issuperset(recorder.renders):
-            raise ValueError(
-                "With `recorder.loop`, `recorder.renders` can be color, depth and normal: leave out others."
-            )
+        others = [render for render in recorder.renders if not PASSES[render].alone]
+        if self.count and others:
+            raise ValueError(f"With `recorder.loop`, `recorder.renders` cannot have {', '.join(others)}: leave it out.")
 
     def __call__(self, state: State, frame: int) -> State:
         """The state to record in place of that of a frame."""
@@ -216,10 +215,11 @@ class Run:
         self.stepper, self.scene = editor.stepper, painter.scene
         if self.stepper.copies is not None:
             check_recorder(recorder)
-        if "vorticity" in recorder.renders and self.stepper.model.air is None:
-            raise ValueError(
-                "`recorder.renders` has `vorticity`, which only computed air has: add `air`, or remove it."
-            )
+        for render in recorder.renders:
+            if PASSES[render].air and self.stepper.model.air is None:
+                raise ValueError(
+                    f"`recorder.renders` has `{render}`, which only computed air has: add `air`, or remove it."
+                )
         self.files: list[Path] = []
         self.log: list[dict[str, Any]] = []
         self._lines: list[str] = []  # the log as a checkpoint stores it, which is written every frame
@@ -405,33 +405,19 @@ class Run:
 
     def picture(self, state: State, gaussians: DeformedGaussians, frame: int, name: str) -> None:
         """Draw the requested pictures of a frame from one camera and pass them to the recorder."""
-        recorder, painter, walls = self.recorder, self.painter, self.walls
+        painter, walls = self.painter, self.walls
         with walls("shading"):
             camera = painter.camera_at(frame, name)
             colours = painter.colors(gaussians, camera)
-        images: dict[str, Tensor] = {}
+        view = View(painter, state, gaussians, camera, colours, force_end=self.force_end)
         with walls("rendering"):
-            if {"color", "depth", "wind", "vorticity"} & set(recorder.renders):
-                picture = painter.draw(gaussians, colours, camera)
-                images["color"] = picture.color
-            if "depth" in recorder.renders:
-                depth, (near, far) = passes.mean_depth(picture), painter.depth_range(frame, name)
-                images["depth"] = passes.depth_colors(depth, near, far)
-                steps = passes.depth_steps(depth * self.scene.frame.metres_per_unit)
-            if "normal" in recorder.renders:
-                images["normal"] = painter.draw_normals(gaussians, camera)
-            if "force" in recorder.renders:
-                pressure = self.stepper.wind_pressure(state)
-                images["force"] = painter.draw_pressure(pressure, gaussians, camera, self.force_end)
-            if "wind" in recorder.renders:
-                images["wind"] = draw_wind(self.stepper, state, camera, picture)
-            if "vorticity" in recorder.renders:
-                images["vorticity"] = draw_vorticity(self.stepper, state, camera, picture)
+            made = [(render, PASSES[render].draw(view)) for render in self.recorder.renders]
+            raws = [(render, raw(view)) for render, _ in made if (raw := PASSES[render].raw)]
         with walls("writing"):
-            for render in recorder.renders:
-                recorder.write_image(frame, images[render], frame_folder(render, name))
-            if "depth" in recorder.renders:
-                recorder.write_depth(frame, steps, frame_folder("depth", name))
+            for render, image in made:
+                self.recorder.write_image(frame, image, frame_folder(render, name))
+            for render, numbers in raws:
+                self.recorder.write_raw(frame, numbers, frame_folder(render, name))
 
     def summary(self, state: State, log: list[dict[str, Any]]) -> dict[str, Any]:
         """The summary of a run; docs/runs.md describes it."""

@@ -25,8 +25,8 @@ from gaussian_swaying._fixed import Fixed, changed
 from gaussian_swaying._turns import Turn, in_turn
 from gaussian_swaying.config.parser import (
     NOT_COMPARED,
+    applied,
     arguments_of,
-    as_filmed,
     build_parser,
     check_settings,
     config_text,
@@ -515,7 +515,7 @@ class Simulation(Fixed):
             changes: As in :meth:`from_yaml`.
         """
         check_settings(cls, settings)
-        settings = as_filmed(settings)
+        settings = applied(settings)
         text = config_text(parser, settings)
         parts: Any = with_custom(parser, settings, parser.instantiate(settings))
         simulation = cls(**{name: parts.get(name) for name in arguments_of(cls)} | changes)

@@ -29,6 +29,7 @@ from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, State
 from gaussian_swaying.mpm.timestep import MAX_CFL, rounding_speed, stable_limit
 from gaussian_swaying.recording.recorder import Recorder
+from gaussian_swaying.rendering.passes import PASSES
 from gaussian_swaying.simulation.body import SimulatedScene
 from gaussian_swaying.simulation.measure import (
     FrameDiagnostics,
@@ -46,9 +47,6 @@ from gaussian_swaying.wind.field import WindField
 from gaussian_swaying.wind.force import AirLift, Wind, WindForce, carried_mass, with_added_mass
 from gaussian_swaying.wind.patches import Patches
 from gaussian_swaying.wind.tables import Shelter
-
-RENDERS = ("color", "depth", "normal")
-"""Renders of a run with copies."""
 
 
 class Copies(nn.Module):
@@ -117,7 +115,7 @@ class Copies(nn.Module):
 def check_recorder(recorder: Recorder) -> None:
     """Raise ValueError if a recorder writes what runs with copies do not have."""
     wrong = [f"`recorder.{name}`" for name in ("trajectory", "nodes") if getattr(recorder, name)]
-    wrong += [f"{render} in `recorder.renders`" for render in recorder.renders if render not in RENDERS]
+    wrong += [f"{render} in `recorder.renders`" for render in recorder.renders if not PASSES[render].alone]
     if wrong:
         raise ValueError(f"`copies` are recorded as pictures only: leave out {', '.join(wrong)}.")
 

@@ -25,33 +25,26 @@ from gaussian_swaying._checks import one_line
 from gaussian_swaying._devices import in_double
 from gaussian_swaying._inputs import spare_memory
 from gaussian_swaying.config.parser import parse_text
-from gaussian_swaying.gaussians.formats import READERS, read_gaussians
+from gaussian_swaying.gaussians.formats import FORMATS, read_gaussians
 from gaussian_swaying.gaussians.labelling import alike, connected
 from gaussian_swaying.gaussians.parts import ROLES, Part, Parts
 from gaussian_swaying.mpm.materials import MATERIALS, name_of
 from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.rendering.brush import Seen, seen, touched
 from gaussian_swaying.rendering.cameras.camera import Camera, resized_intrinsics
-from gaussian_swaying.rendering.passes import colormap
+from gaussian_swaying.rendering.passes import PASSES, colormap
 from gaussian_swaying.rendering.tints import TINTS
 from gaussian_swaying.simulation.draw import speed_scale
 from gaussian_swaying.simulation.model import POLAR, angles_of, flow_of, number
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.suggestion.suggest import suggest
-from gaussian_swaying.viewer.pictures import SHOWN, FilmStrip, under_cursor
+from gaussian_swaying.viewer.pictures import FilmStrip, under_cursor
 from gaussian_swaying.viewer.screen import Panel, Screen
 from gaussian_swaying.viewer.session import Session, Snapshot
 from gaussian_swaying.viewer.streams import BrushMove
 
 KINDS = {"Sway": "SineSway", "Gusts": "UniformGust", "Noise": "GaussianGust"}
-FIELDS: dict[str, tuple[str, float, float, float]] = {  # label, least, most, step
-    "amplitude": ("Amplitude [share]", 0.0, 2.0, 0.05),
-    "delta": ("Strength [share]", 0.0, 1.0, 0.05),
-    "std": ("Strength [m/s]", 0.0, 10.0, 0.1),
-    "period": ("Period [s]", 0.05, 60.0, 0.05),
-    "phase": ("Phase [rad]", -6.3, 6.3, 0.1),
-    "interval": ("Interval [s]", 0.01, 10.0, 0.01),
-}
+WIDEST = 500.0  # range of a slider
 NONE = "Add sway, gusts or noise"
 
 
@@ -96,9 +89,8 @@ class Gusts:
             for field, value in (modulation.get("init_args") or {}).items():
                 if isinstance(value, bool) or not isinstance(value, (int, float)):
                     continue
-                label, least, most, step = FIELDS.get(field, (field, -math.inf, math.inf, 0.1))
-                least, most = min(least, value), max(most, value)
-                control = found[field] = self.gui.add_number(label, float(value), min=least, max=most, step=step)
+                name = f"wind.modulations.{place}.{field}"
+                control = found[field] = number_control(self.gui, name, field.capitalize(), float(value))
                 self._controls.on(control.on_update, self._changed)
             remove = self.gui.add_button("Remove")
             self._controls.on(remove.on_click, lambda: self._remove(place))
@@ -130,6 +122,17 @@ class Gusts:
 
     def _set(self, modulations: list[dict[str, Any]]) -> None:
         self.session.change({"wind.modulations": modulations})
+
+
+def number_control(gui: Any, name: str, label: str, value: float) -> Any:
+    """A control of a number that may change: a slider if its range has two ends within reach, else a field."""
+    known = number(name)
+    label += f" [{known.unit}]" if known.unit else ""
+    wide = known.high - known.low
+    if wide <= WIDEST:
+        return gui.add_slider(label, known.low, known.high, wide / 100, value)
+    low, high = (None if math.isinf(end) else end for end in (known.low, known.high))
+    return gui.add_number(label, value, min=low, max=high, step=0.01)
 
 
 def _plain(modulation: Any) -> dict[str, Any]:
@@ -674,7 +677,6 @@ if TYPE_CHECKING:
     from jsonargparse import Namespace
 
 Folder = tempfile.TemporaryDirectory[str]
-UPLOADS = [suffix for suffix in READERS if suffix not in (".json", ".gltf")]  # with files beside them
 RECORD = "Record a video (simulated time)"
 
 
@@ -689,6 +691,7 @@ class Files:
 
     def __init__(self, controls: Panel, loaded: Callable[[], None], as_saved: Callable[[str], str]) -> None:
         self._loaded, self._as_saved, self.page, self.session = loaded, as_saved, controls.page, controls.session
+        self._kinds = [ending for format in FORMATS.values() if format.read for ending in format.endings]
         self._upload: Folder | None = None  # where the splat lies that was loaded
         gui, elsewhere = controls.server.gui, self.page.door.token is not None
         self.record = gui.add_button(
@@ -701,7 +704,7 @@ class Files:
             disabled=elsewhere,  # a configuration can name files of this computer
             hint="Only on a page that other computers cannot open" if elsewhere else "Such as one that was saved here",
         )
-        kinds = ",".join(UPLOADS)
+        kinds = ",".join(self._kinds)
         self.load = gui.add_upload_button("Load a splat", mime_type=kinds, hint=f"One of {kinds}")
         controls.on(self.record.on_click, self._toggle_recording, tell_event=True)
         controls.on(self.save.on_click, self._save, tell_event=True)
@@ -762,7 +765,7 @@ class Files:
         self.load.disabled, self.load_settings.disabled = False, self.page.door.token is not None
 
     def _splat(self, content: bytes, suffix: str, folder: Folder) -> Namespace:
-        path = Path(folder.name) / f"scene{suffix if suffix in UPLOADS else '.ply'}"
+        path = Path(folder.name) / f"scene{suffix if suffix in self._kinds else '.ply'}"
         path.write_bytes(content)
         device = self.session.simulation.device
         quick = device.type == "cpu"  # no trial looks for a grid
@@ -896,29 +899,24 @@ class Controls(Panel):
         for name in model.numbers("forces."):
             if not self.forces:
                 folder = self.server.gui.add_folder("Forces")
-            known = number(name)
-            label = name.removeprefix("forces.") + (f" [{known.unit}]" if known.unit else "")
-            low, high = (None if math.isinf(end) else end for end in (known.low, known.high))
             with folder:
-                control = self.forces[name] = self.server.gui.add_number(
-                    label, model.value(name), min=low, max=high, step=0.01
-                )
+                label, value = name.removeprefix("forces."), model.value(name)
+                control = self.forces[name] = number_control(self.server.gui, name, label, value)
             self.on(control.on_update, lambda name=name, control=control: self._set(name, control.value))
 
     def _picture(self) -> None:
         gui = self.server.gui
-        self.shown = gui.add_dropdown("Show", SHOWN, initial_value=SHOWN[0])
+        self.shown = gui.add_dropdown("Show", [name for name, own in PASSES.items() if not own.air])
         self.by_browser = gui.add_checkbox(
             "Drawn by the browser", True, hint="Off: pictures from the server, whose colours depend on the view"
         )
         self.light = gui.add_slider("Light from [deg]", -180.0, 180.0, 1.0, 0.0)
         self.shading = gui.add_checkbox("Shading", True)
-        self.streaks = gui.add_checkbox("Streaks of air", False, hint="Coloured by speed, near a plane along the wind")
         self.arrow = gui.add_checkbox("Arrow of the wind", True)
         self.box = gui.add_checkbox("Box of the grid", False)
         self.pins = gui.add_checkbox("What is held", False, hint="Points that pins and handles hold, at rest")
         changed: dict[Callable[[], None], tuple[Any, ...]] = {
-            self._show: (self.shown, self.by_browser, self.streaks),
+            self._show: (self.shown, self.by_browser),
             self._shade: (self.light, self.shading),
             self.draw_handles: (self.arrow, self.box, self.pins),
         }
@@ -1000,12 +998,12 @@ class Controls(Panel):
 
     def _show_legends(self) -> None:
         simulation = self.session.simulation
-        parts = []
-        if self.shown.value == "wind force":
-            parts.append(legend("Force of the wind", "Pa", self.page.force_end))
-        if self.streaks.value:
-            parts.append(legend("Speed of the air", "m/s", speed_scale(simulation.stepper)))
-        self.legends.content, self.legends.visible = "".join(parts), bool(parts)
+        content = ""
+        if self.shown.value == "force":
+            content = legend("Force of the wind", "Pa", self.page.force_end)
+        elif self.shown.value == "wind":
+            content = legend("Speed of the air", "m/s", speed_scale(simulation.stepper))
+        self.legends.content, self.legends.visible = content, bool(content)
 
     # ---- what they do
 
@@ -1052,8 +1050,7 @@ class Controls(Panel):
         self._draw_arrow(flow)
 
     def _show(self) -> None:
-        self.page.shown, self.page.streaks = self.shown.value, self.streaks.value
-        self.page.by_browser = self.by_browser.value
+        self.page.shown, self.page.by_browser = self.shown.value, self.by_browser.value
         self.page.redraw()
         self._show_legends()
 

@@ -6,7 +6,6 @@ import math
 import tempfile
 import threading
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +17,11 @@ from gaussian_swaying._devices import in_double
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.recording.video import VideoEncoder
 from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.rendering.passes import PASSES
 from gaussian_swaying.rendering.tints import by_role
-from gaussian_swaying.simulation.draw import draw_wind
+from gaussian_swaying.simulation.draw import View
 from gaussian_swaying.viewer.session import Snapshot
 
-SHOWN = ("colour", "normals", "wind force")
 LEAST = 96  # pixels of the shorter side
 SIZES = (1.0, 0.75, 0.5, 0.375, 0.25)
 
@@ -57,9 +56,8 @@ def pinhole(rotation: Tensor, eye: Tensor, fov: float, width: int, height: int, 
 def draw(
     snapshot: Snapshot,
     camera: Camera,
-    shown: str = "colour",
+    shown: str = "color",
     force_end: float = 1.0,
-    streaks: bool = False,
     roles: Tensor | None = None,
 ) -> np.ndarray:
     """The picture of a snapshot, uint8, shape (H, W, 3).
@@ -67,32 +65,16 @@ def draw(
     Args:
         snapshot: The snapshot to draw.
         camera: The camera.
-        shown: One of :data:`SHOWN`.
+        shown: The name of a pass.
         force_end: End of the colour scale of the wind force [Pa].
-        streaks: Whether streaks of air are drawn over it, as in the render ``wind``.
         roles: Roles whose tints the colours get, as in :func:`~gaussian_swaying.rendering.tints.by_role`, shape (N,).
     """
-    simulation, state = snapshot.simulation, snapshot.state
-    painter = simulation.painter
-    means = simulation.scene.model.means
-    camera = camera.to(means.device, means.dtype)
-    gaussians = painter.deformed(state)
-    seen = None
-    if shown == "normals":
-        picture = painter.draw_normals(gaussians, camera, "world", smooth=True)
-    elif shown == "wind force":
-        picture = painter.draw_pressure(
-            simulation.stepper.wind_pressure(state), gaussians, camera, force_end, smooth=True
-        )
-    else:
-        colours = painter.colors(gaussians, camera)
-        if roles is not None and len(roles) == len(colours):  # not those of a scene that was just replaced
-            colours = by_role(colours, roles)
-        seen = painter.draw(gaussians, colours, camera)
-        picture = seen.color
-    if streaks:
-        seen = seen or painter.draw(gaussians, torch.zeros_like(gaussians.means), camera)  # for its depth
-        picture = draw_wind(simulation.stepper, state, camera, replace(seen, color=picture))
+    painter, state = snapshot.simulation.painter, snapshot.state
+    means = painter.scene.model.means
+    camera, gaussians, colours = camera.to(means.device, means.dtype), painter.deformed(state), None
+    if roles is not None and len(roles) == len(gaussians.means):  # not those of a scene that was just replaced
+        colours = by_role(painter.colors(gaussians, camera), roles)
+    picture = PASSES[shown].draw(View(painter, state, gaussians, camera, colours, True, force_end))
     return (picture.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
 
 

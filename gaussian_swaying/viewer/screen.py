@@ -266,8 +266,7 @@ class Screen:
         names: Names of this computer that a browser may ask for, besides those that it has.
 
     Attributes:
-        shown: The kind of picture, one of :data:`.pictures.SHOWN`.
-        streaks: Whether streaks of air are drawn over it.
+        shown: The name of the pass that is shown.
         by_browser: Whether browsers draw, where they can.
         roles: Roles whose tints are shown (see :func:`.tints.by_role`), shape (N,), or None; redraw after a change.
         recording: The video that is being recorded, or None.
@@ -285,8 +284,7 @@ class Screen:
     ) -> None:
         self.largest = largest
         self.session: Session
-        self.shown = "colour"
-        self.streaks = False
+        self.shown = "color"
         self.by_browser = True
         self.roles: torch.Tensor | None = None
         self.force_end = 1.0
@@ -481,7 +479,7 @@ class Screen:
 
     def _drawn_there(self, client: viser.ClientHandle, snapshot: Snapshot) -> bool:
         recorded = self.recording is not None and self.recorder == client.client_id
-        plain = self.by_browser and self.shown == "colour" and not self.streaks
+        plain = self.by_browser and self.shown == "color"
         return plain and not recorded and drawable(snapshot)
 
     def _send(self, client: viser.ClientHandle, snapshot: Snapshot, size: PictureSize) -> None:
@@ -492,7 +490,7 @@ class Screen:
         camera = camera_of(pose.wxyz.tolist(), pose.position.tolist(), float(pose.fov), width, height, near)
         with self._drawing, self.session.lock:
             waited = time.perf_counter()
-            picture = draw(snapshot, camera, self.shown, self.force_end, self.streaks, self.roles)
+            picture = draw(snapshot, camera, self.shown, self.force_end, self.roles)
         if not still:
             size.took(time.perf_counter() - waited)
         self.drawn_size = (width, height)

@@ -8,10 +8,10 @@ import torch
 from PIL import Image
 from shared import refused
 
+from gaussian_swaying.captures.capture_camera import read_views
 from gaussian_swaying.cli.camera import fov_of, main, painter_of
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
-from gaussian_swaying.rendering.cameras.transforms_json import camera_from_transforms
 from gaussian_swaying.scenes.procedural import FlagScene
 
 pytest.importorskip("cv2")
@@ -36,10 +36,10 @@ def _off(camera):
 def test_the_camera_of_a_picture_and_its_field_of_view(flag, capsys):
     given = [str(flag / "first.png"), str(flag / "flag.ply"), "--up", "0", "0", "1", "--output", str(flag / "out")]
     assert main(given) == 0
-    assert fov_of(camera_from_transforms(flag / "out/transforms.json", 0)) == pytest.approx(42, abs=1.5)
+    assert fov_of(read_views(flag / "out/transforms.json")[0][1]) == pytest.approx(42, abs=1.5)
     assert main([*given, "--fov", "42"]) == 0
     assert "points agree on the camera" in capsys.readouterr().out
-    found = camera_from_transforms(flag / "out/transforms.json", 0)
+    found = read_views(flag / "out/transforms.json")[0][1]
     assert _off(found) < 0.5
     assert (found.position - CAMERA.position).norm() < 0.02
     assert json.loads((flag / "out/transforms.json").read_text())["frames"][0]["file_path"] == "../first.png"

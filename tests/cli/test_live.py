@@ -15,7 +15,7 @@ from gaussian_swaying.cli import live, scene
 from gaussian_swaying.cli.preview import main as preview
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.config.parser import config_text
-from gaussian_swaying.gaussians.export import export_cloud
+from gaussian_swaying.gaussians.formats import export_cloud
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.scenes import FlagScene
 from gaussian_swaying.scenes.alocasia import alocasia

@@ -10,7 +10,7 @@ from shared import SMALL, peak, refused, words
 
 from gaussian_swaying import read_gaussians, write_ply
 from gaussian_swaying.cli.main import main
-from gaussian_swaying.gaussians.export import SUFFIXES
+from gaussian_swaying.gaussians.formats import FORMATS
 from gaussian_swaying.scenes import FlagScene
 
 FLAG = FlagScene(spacing=0.1).generate()
@@ -55,7 +55,7 @@ def test_eval(place):
     assert [row["mse"] for row in found["per_frame"]] == [0.0] * 4
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES.values())
+@pytest.mark.parametrize("suffix", [format.endings[0] for format in FORMATS.values()])
 def test_export(place, suffix):
     """Places within a thousandth of the flag, and turned with z up where a format says which axis that is."""
     if suffix == ".usdc":

@@ -10,8 +10,7 @@ from shared import near, user_warning
 from small_scenes import varied_cloud
 from torch.testing import assert_close
 
-from gaussian_swaying.gaussians.export import export_cloud
-from gaussian_swaying.gaussians.formats import read_gaussians
+from gaussian_swaying.gaussians.formats import export_cloud, read_gaussians
 from gaussian_swaying.gaussians.harmonics import SH_DC
 
 

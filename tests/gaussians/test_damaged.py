@@ -14,8 +14,7 @@ import torch
 from damage import changed, damaged
 from other_writers import FILES, glb, glb_parts, members, packed, scene
 
-from gaussian_swaying.gaussians.export import export_cloud
-from gaussian_swaying.gaussians.formats import read_gaussians
+from gaussian_swaying.gaussians.formats import export_cloud, read_gaussians
 
 LINES = (
     b"element vertex 4000000000", b"element vertex -1", b"element vertex 9223372036854775808", b"element face 3",

@@ -11,17 +11,15 @@ from small_scenes import varied_cloud
 from torch.testing import assert_close
 from usd_files import read_usd_frame
 
-from gaussian_swaying.gaussians.export import (
-    SUFFIXES,
-    UsdFilm,
+from gaussian_swaying.gaussians.formats import (
+    FORMATS,
     cleaned,
     export_cloud,
     export_frames,
     format_of,
-    usd_arrays,
-    write_usd,
+    read_gaussians,
 )
-from gaussian_swaying.gaussians.formats import read_gaussians
+from gaussian_swaying.gaussians.usd import UsdFilm, usd_arrays, write_usd
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 
 
@@ -34,7 +32,7 @@ def test_one_bad_value_does_not_empty_the_file(tmp_path):
     gone = [3, 6, 7, 8, 9]
     kept = torch.tensor([k for k in range(300) if k not in gone])
     for format in ("splat", "compressed_ply", "ply"):
-        path = tmp_path / f"a{SUFFIXES[format]}"
+        path = tmp_path / f"a{FORMATS[format].endings[0]}"
         with user_warning(r"left out 5 of 300 Gaussians: .*; 1 of 300 .* flat"):
             export_cloud(path, cloud, format=format)
         count = len(kept) - (1 if format == "compressed_ply" else 0)  # the fifth is clear, and so left out there
@@ -59,7 +57,7 @@ def test_equal_values_in_a_chunk_are_kept(tmp_path):
 
 def test_what_cannot_be_written_leaves_nothing(tmp_path):
     cloud = varied_cloud(3)
-    with value_error(f"`format` to be one of {', '.join(SUFFIXES)}, but got 'obj'"):
+    with value_error(f"`format` to be one of {', '.join(FORMATS)}, but got 'obj'"):
         export_cloud(tmp_path / "a.obj", cloud, format="obj")
     with pytest.raises(FileNotFoundError, match="is not a folder"):
         export_cloud(tmp_path / "no" / "a.splat", cloud, format="splat")

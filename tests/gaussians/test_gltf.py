@@ -14,8 +14,7 @@ from shared import near, peak, user_warning, value_error
 from small_scenes import varied_cloud
 from torch.testing import assert_close
 
-from gaussian_swaying.gaussians.export import export_cloud
-from gaussian_swaying.gaussians.formats import read_gaussians
+from gaussian_swaying.gaussians.formats import export_cloud, read_gaussians
 from gaussian_swaying.gaussians.gltf import encode_gltf, read_gltf
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.geometry.covariances import covariance

@@ -14,8 +14,7 @@ from shared import silent, user_warning, value_error
 from small_scenes import varied_cloud
 
 from gaussian_swaying.gaussians.cloud import joined
-from gaussian_swaying.gaussians.export import export_cloud
-from gaussian_swaying.gaussians.formats import read_gaussians
+from gaussian_swaying.gaussians.formats import export_cloud, read_gaussians
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.geometry.regions import Box

@@ -18,8 +18,7 @@ from small_scenes import together, varied_cloud
 from torch.testing import assert_close
 
 from gaussian_swaying.gaussians import sog
-from gaussian_swaying.gaussians.export import export_cloud
-from gaussian_swaying.gaussians.formats import read_gaussians
+from gaussian_swaying.gaussians.formats import export_cloud, read_gaussians
 from gaussian_swaying.gaussians.sog import read_sog
 from gaussian_swaying.simulation.body import Scene
 

@@ -15,8 +15,7 @@ from small_scenes import varied_cloud
 from torch.testing import assert_close
 
 from gaussian_swaying._inputs import spare_memory
-from gaussian_swaying.gaussians.export import export_cloud
-from gaussian_swaying.gaussians.formats import read_gaussians
+from gaussian_swaying.gaussians.formats import export_cloud, read_gaussians
 from gaussian_swaying.gaussians.spz import encode_spz, read_spz
 
 from .test_round_trips import SMALLEST_THREE, SPZ

@@ -16,7 +16,7 @@ import pytest
 import torch
 from shared import advanced, near, peak, value_error, without_waits
 
-from gaussian_swaying.config.parser import as_filmed
+from gaussian_swaying.config.parser import applied
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.gaussians.ply import read_ply
 from gaussian_swaying.geometry.covariances import covariance
@@ -556,7 +556,7 @@ def test_the_end_of_a_motion_becomes_its_beginning(make_simulation, tmp_path):
 def test_what_cannot_close(make_simulation, tmp_path):
     with value_error(r"`frames` to more than 10, or shorten `recorder.loop`"):
         _run(make_simulation(), tmp_path / "run", 10, Recorder(loop=0.2))
-    with value_error(r"With `recorder.loop`, `recorder.renders` can be color, depth and normal"):
+    with value_error(r"With `recorder.loop`, `recorder.renders` cannot have force"):
         _run(make_simulation(), tmp_path / "run", 10, Recorder(loop=0.04, renders=("color", "force")))
 
 
@@ -564,13 +564,13 @@ def test_slow_motion_and_loops_of_the_command_line():
     """A film of as many frames of the same speed, from finer steps of time, and more frames before one that closes."""
     parser = Simulation.parser()
     plain = parser.parse_args(["--frames=51", "--frame_dt=0.04"])
-    found = as_filmed(parser.parse_args(["--frames=51", "--frame_dt=0.04", "--slow=4", "--loop=2"]))
+    found = applied(parser.parse_args(["--frames=51", "--frame_dt=0.04", "--slow=4", "--loop=2"]))
     assert (found.frames, found.frame_dt) == (201 + 50, 0.01)
     assert (found.recorder.fps, found.recorder.loop) == (25.0, 0.5)
-    assert as_filmed(plain).recorder == plain.recorder
-    assert as_filmed(parser.parse_args(["--loop", "--frames=51"])).recorder.loop == 1.0
+    assert applied(plain).recorder == plain.recorder
+    assert applied(parser.parse_args(["--loop", "--frames=51"])).recorder.loop == 1.0
     with value_error("`slow` to be positive"):
-        as_filmed(parser.parse_args(["--slow=0"]))
+        applied(parser.parse_args(["--slow=0"]))
 
 
 # ---- the folder

@@ -9,7 +9,7 @@ from shared import double, value_error
 
 from gaussian_swaying.captures.capture_camera import CaptureCamera
 from gaussian_swaying.rendering.cameras.camera import orbit_camera
-from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera, TransformsCamera
+from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera
 from gaussian_swaying.rendering.cameras.keyframes import CameraKey, KeyframedCamera
 
 
@@ -65,17 +65,15 @@ def test_bad_orbit_arguments(arguments, error, field):
         OrbitCamera(**arguments)
 
 
-def test_bad_look_at_and_transforms_arguments():
+def test_bad_look_at_and_capture_arguments():
     with value_error("`eye`"):
         LookAtCamera((0, 0), (0, 0, 0))
     with value_error("`eye` and `target`"):
         LookAtCamera((0, 0, 0), (0, 0, 0))
     with value_error("`up`"):
         LookAtCamera((0, 0, 1), (0, 0, 0), up=(0, 0, 0))
-    with value_error("`frame`"):
-        TransformsCamera("transforms.json", -1)
     with pytest.raises(TypeError, match="`width`"):
-        TransformsCamera("transforms.json", width=0.5)
+        CaptureCamera("transforms.json", width=0.5)
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
@@ -89,7 +87,6 @@ def test_the_near_plane_has_the_size_of_the_scene(unit, tmp_path):
         (lambda **near: OrbitCamera(radius=2.0, **near), 0.02),
         (lambda **near: LookAtCamera((0.0, 0.0, 0.0), (0.0, 3.0 * unit, 0.0), **near), 0.03),
         (lambda **near: KeyframedCamera([CameraKey(0.0, eye=[2 * unit, unit, 2 * unit])], **near), 0.01),
-        (lambda **near: TransformsCamera(file, **near), 0.01),
         (lambda **near: CaptureCamera(file, 0, **near), 0.01),
     ):
         assert make()(0, 0.0, centre, up, unit).near == pytest.approx(expected * unit)

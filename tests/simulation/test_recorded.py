@@ -13,8 +13,7 @@ from shared import peak, refused, seeded, up_to, user_warning, value_error
 
 from gaussian_swaying.cli.export import main as export
 from gaussian_swaying.gaussians.cloud import joined
-from gaussian_swaying.gaussians.export import SUFFIXES, export_cloud
-from gaussian_swaying.gaussians.formats import read_gaussians
+from gaussian_swaying.gaussians.formats import FORMATS, export_cloud, read_gaussians
 from gaussian_swaying.gaussians.ply import read_ply, write_ply
 from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera
 from gaussian_swaying.scenes.procedural import FlagScene
@@ -73,7 +72,7 @@ def test_the_frames_of_a_run_are_those_of_its_simulation(recorded):
     assert moved > 0.01
 
 
-@pytest.mark.parametrize("format", SUFFIXES)
+@pytest.mark.parametrize("format", FORMATS)
 def test_a_run_is_exported_in_every_format(recorded, format, tmp_path, capsys):
     """The folder is made; each file is what its Gaussians write; USD has the times of the run."""
     simulation, run = recorded
@@ -81,16 +80,17 @@ def test_a_run_is_exported_in_every_format(recorded, format, tmp_path, capsys):
         pytest.importorskip("pxr")
         assert export([str(run), str(tmp_path / "new/film.usdc")]) == 0
         return _check_film(simulation, run, tmp_path / "new/film.usdc")
-    name = f"new/f_##{SUFFIXES[format]}"
+    ending = FORMATS[format].endings[0]
+    name = f"new/f_##{ending}"
     assert export([str(run), str(tmp_path / name)]) == 0
     out = capsys.readouterr().out
     assert f"wrote {tmp_path / name}, {FRAMES} files" in out
     assert ("up [0.0, 1.0, 0.0], 1 scene unit = 2 m (from the run)" in out) == (format == "glb")
     place = simulation.scene.frame
     for index, gaussians in enumerate(RecordedRun(run).frames()):
-        one = tmp_path / f"one{SUFFIXES[format]}"
+        one = tmp_path / f"one{ending}"
         export_cloud(one, gaussians, metres_per_unit=place.metres_per_unit, rotation=place.rotation)
-        assert (tmp_path / f"new/f_{index:02d}{SUFFIXES[format]}").read_bytes() == one.read_bytes()
+        assert (tmp_path / f"new/f_{index:02d}{ending}").read_bytes() == one.read_bytes()
     assert len(list((tmp_path / "new").iterdir())) == FRAMES
 
 
@@ -159,12 +159,13 @@ def test_a_frame_saves_its_gaussians(recorded, tmp_path):
     """By the ending or by the name of a format; metres and axes where the format has them."""
     simulation, _ = recorded
     (frame,) = simulation.frames(1)
-    for format, suffix in SUFFIXES.items():
+    for format, known in FORMATS.items():
         if format != "usd":
-            frame.save(tmp_path / f"a{suffix}")
+            path = tmp_path / f"a{known.endings[0]}"
+            frame.save(path)
             frame.save(tmp_path / "b", format=format)
-            assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / "b").read_bytes()
-            assert len(read_gaussians(tmp_path / f"a{suffix}")) == 96
+            assert path.read_bytes() == (tmp_path / "b").read_bytes()
+            assert len(read_gaussians(path)) == 96
     frame.save(tmp_path / "a.png")
     shown = (frame.render().color.clamp(0, 1) * 255).round().numpy()
     assert np.abs(iio.imread(tmp_path / "a.png") - shown).max() <= 1
@@ -177,7 +178,7 @@ def test_a_frame_saves_its_gaussians(recorded, tmp_path):
     before = sorted(tmp_path.iterdir())
     with value_error(r"Cannot tell the format of .*frame\.obj: .*\.splat"):
         frame.save(tmp_path / "frame.obj")
-    with value_error(f"`format` to be one of {', '.join(SUFFIXES)}"):
+    with value_error(f"`format` to be one of {', '.join(FORMATS)}"):
         frame.save(tmp_path / "frame.ply", format="obj")
     with pytest.raises(FileNotFoundError, match="is not a folder; create it first"):
         frame.save(tmp_path / "none" / "0001.ply")

@@ -13,6 +13,7 @@ from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera
 from gaussian_swaying.rendering.passes import colormap, mean_depth
 from gaussian_swaying.rendering.shading import DiffuseShader
+from gaussian_swaying.simulation.draw import View
 from gaussian_swaying.simulation.model import Edit
 from gaussian_swaying.wind.field import WindField
 from gaussian_swaying.wind.force import AeroForce
@@ -66,12 +67,16 @@ def test_the_depth_on_disk_is_in_metres(make_simulation, tmp_path):
     assert not (tmp_path / "run" / "video.mp4").exists()
 
 
+def _at_rest(simulation, camera="", **more):
+    painter = simulation.painter
+    return View(painter, simulation.start(), painter.scene.rest(), painter.camera_at(0, camera), **more)
+
+
 def test_normals_of_a_flat_flag(make_simulation):
     """Seen along its normal -y: towards the camera in its axes, -y in the world's, whatever the scene's up."""
     simulation = _cameras(make_simulation(), side=SIDE)
-    camera, rest = simulation.painter.camera_at(0, "side"), simulation.scene.rest()
-    for axes, normal in (("camera", [0.0, 0.0, 1.0]), ("world", [0.0, -1.0, 0.0])):
-        found = 2 * simulation.painter.draw_normals(rest, camera, axes)[10, 12] - 1
+    for world, normal in ((False, [0.0, 0.0, 1.0]), (True, [0.0, -1.0, 0.0])):
+        found = 2 * _at_rest(simulation, "side", live=world).normals()[10, 12] - 1
         # the flag ripples: its slope is up to 2 pi 1.5 ripple / width = 0.24
         assert float(found @ torch.tensor(normal)) > 0.95
         assert float(found.norm()) == pytest.approx(1.0, abs=1e-5)
@@ -79,8 +84,8 @@ def test_normals_of_a_flat_flag(make_simulation):
 
 def test_normals_in_world_axes_are_those_of_the_z_up_frame(flag_ply, make_simulation):
     simulation = _cameras(make_simulation(read_ply(flag_ply), pinned=False, scene={"up": [0.0, 1.0, 0.0]}), side=SIDE)
-    painter, normals = simulation.painter, simulation.scene.patches.normal
-    found = 2 * painter.draw_normals(painter.scene.rest(), painter.camera_at(0, "side"), "world")[10, 12] - 1
+    normals = simulation.scene.patches.normal
+    found = 2 * _at_rest(simulation, "side", live=True).normals()[10, 12] - 1
     expected = normals[len(normals) // 2]
     assert abs(float(found @ expected)) > 0.95
     assert abs(float(found[2])) < 0.1  # the flag hangs, so no normal points up
@@ -94,8 +99,7 @@ def test_the_force_is_that_of_the_wind(make_simulation):
     pressure = simulation.stepper.wind_pressure(state)
     torch.testing.assert_close(pressure, torch.full_like(pressure, 0.5 * 1.225 * 16 * 0.5))
     assert simulation.stepper.force_scale() == pytest.approx(float(pressure[0]))
-    camera = simulation.painter.camera_at(0)
-    picture = simulation.painter.draw_pressure(pressure, simulation.scene.rest(), camera, 2 * float(pressure[0]))
+    picture = _at_rest(simulation, force_end=2 * float(pressure[0])).pressure()
     covered = picture.any(-1)
     assert covered.any()
     expected = colormap(torch.tensor(0.5)).expand_as(picture[covered])

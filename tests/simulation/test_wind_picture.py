@@ -11,7 +11,7 @@ from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
 from gaussian_swaying.rendering.passes import mean_depth
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.draw import STEPS, draw_vorticity, draw_wind, streaks
+from gaussian_swaying.simulation.draw import STEPS, View, streaks
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.wind.computed_air import ComputedAir
 from gaussian_swaying.wind.effects import Obstacle
@@ -77,14 +77,14 @@ def test_the_object_hides_what_is_behind_it(make_simulation):
     """Air is drawn over the background, and the picture without air is the pale one of the object."""
     simulation = make_simulation()
     state = simulation.start()
-    camera, picture = simulation.painter.camera_at(0), simulation.painter.render(state, 0)
-    found = draw_wind(simulation.stepper, state, camera, picture)
-    pale = 0.75 * picture.color.clamp(0, 1) + 0.25
-    assert found.shape == picture.color.shape
+    painter = simulation.painter
+    view = View(painter, state, painter.deformed(state), painter.camera_at(0))
+    found = view.wind()
+    pale = 0.75 * view.picture.color.clamp(0, 1) + 0.25
+    assert found.shape == pale.shape
     assert (found - pale).abs().amax(-1).gt(0.05).float().mean() > 0.02
     simulation.wind = WindField([0.0, 0.0, 0.0])
-    still = draw_wind(simulation.stepper, state, camera, picture)
-    assert torch.isfinite(still).all()
+    assert torch.isfinite(view.wind()).all()
 
 
 @pytest.mark.parametrize("flow", [[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]])
@@ -116,9 +116,8 @@ def test_vorticity_is_red_where_air_turns_against_the_clock(spin):
     state.air[1:4] = torch.stack([-spin / 2 * z, 0 * x, spin / 2 * x]) / stepper.air.flow.units.speed
     inside = stepper.air.vorticity_at(state.air, torch.tensor([[0.1, 0.2, 0.3], [0.1, 0.2, 3.0]]))
     torch.testing.assert_close(inside, torch.tensor([[0.0, -spin, 0.0], [0.0, 0.0, 0.0]]), rtol=1e-4, atol=1e-3)
-    gaussians = simulation.painter.deformed(state)
-    seen = simulation.painter.draw(gaussians, simulation.painter.colors(gaussians, camera), camera)
-    found = draw_vorticity(stepper, state, camera, seen)
+    view = View(simulation.painter, state, simulation.painter.deformed(state), camera)
+    seen, found = view.picture, view.vorticity()
     change = found - (0.5 * seen.color.clamp(0, 1) + 0.5)
     size = float((state.position.amax(0) - state.position.amin(0)).amax())
     colour = torch.tensor([0.70, 0.09, 0.17] if spin > 0 else [0.13, 0.40, 0.67])
@@ -127,13 +126,13 @@ def test_vorticity_is_red_where_air_turns_against_the_clock(spin):
     red_less_blue = change[..., 0] - change[..., 2]
     assert float(red_less_blue[32, 62]) * spin > 1.0  # behind the flag
     assert float(peak(change[2, 2])) == 0
-    bare = draw_vorticity(stepper, state.replace(air=torch.zeros_like(state.air)), camera, seen)
+    bare = replace(view, state=state.replace(air=torch.zeros_like(state.air))).vorticity()
     assert float(peak(bare - (0.5 * seen.color.clamp(0, 1) + 0.5))) == 0
     covered = mean_depth(seen) > 0
     assert covered[32, 48]
     for nearer, hides in ((0.9, True), (1.1, False)):  # the flag in front of the plane, and behind it
-        moved = replace(seen, depth=nearer * seen.depth)
-        change = draw_vorticity(stepper, state, camera, moved) - (0.5 * seen.color.clamp(0, 1) + 0.5)
+        vars(view)["picture"] = replace(seen, depth=nearer * seen.depth)
+        change = view.vorticity() - (0.5 * seen.color.clamp(0, 1) + 0.5)
         assert bool((change[covered] == 0).all()) == hides
 
 

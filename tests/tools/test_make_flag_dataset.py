@@ -14,7 +14,7 @@ import torch
 from shared import value_error
 
 from gaussian_swaying.captures.capture import read_capture
-from gaussian_swaying.rendering.cameras.camera_path import TransformsCamera
+from gaussian_swaying.captures.capture_camera import CaptureCamera
 
 from .conftest import beside
 
@@ -130,7 +130,7 @@ def test_motion_is_solved_once_and_says_what_changed(reference, flag_motion, mon
 
 def _seen(fields_path, frame, points):
     """Pixels at which a camera of this package sees points."""
-    camera = TransformsCamera(fields_path, frame)(0, 0.0, torch.zeros(3).double(), torch.zeros(3), 1.0)
+    camera = CaptureCamera(fields_path, frame)(0, 0.0, torch.zeros(3).double(), torch.zeros(3), 1.0)
     local = points @ camera.world_to_camera[:3, :3].T.numpy() + camera.world_to_camera[:3, 3].numpy()
     image = local @ camera.intrinsics.numpy().T
     return image[:, :2] / image[:, 2:], local[:, 2]
@@ -141,7 +141,7 @@ def test_training_views_hold_the_whole_flag_and_are_ours_too(reference, flag_pic
     pattern = reference.PATTERNS[3]
     views = flag_pictures.sphere_views(pattern, 40, 100)
     path = tmp_path / "transforms.json"
-    path.write_text(json.dumps(flag_pictures.transforms_fields(views, [f"{i}.png" for i in range(40)])))
+    path.write_text(json.dumps(flag_pictures.transforms_fields(views, [f"{i:02}.png" for i in range(40)])))
     corners = pattern.rest(np.array([[0.0, 0], [0, 1], [1, 0], [1, 1]]))[0]
     rays = []
     for index, view in enumerate(views):

@@ -8,7 +8,7 @@ import yaml
 from browsers import until
 
 pytest.importorskip("viser", reason="needs the extra [viewer]")
-from gaussian_swaying.gaussians.export import export_cloud
+from gaussian_swaying.gaussians.formats import export_cloud
 from gaussian_swaying.mpm.materials import MATERIALS
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.viewer import session as session_module
@@ -139,15 +139,14 @@ def test_the_table_of_materials_has_no_gap():
 def test_wind_force_and_streaks_have_legends(page, client):
     controls = page.controls
     assert not controls.legends.visible
-    client.set(controls.shown, "wind force")
+    client.set(controls.shown, "force")
     until(lambda: controls.legends.visible)
     assert legend("Force of the wind", "Pa", page.session.simulation.stepper.force_scale()) == controls.legends.content
-    client.set(controls.shown, "colour")
-    client.set(controls.streaks, True)
+    client.set(controls.shown, "wind")
     until(lambda: "Speed of the air [m/s]" in controls.legends.content and "Force" not in controls.legends.content)
     client.set(controls.wind_speed, 20.0)
     until(lambda: ">30 and more<" in controls.legends.content)  # 1.5 times the flow
-    client.set(controls.streaks, False)
+    client.set(controls.shown, "color")
     until(lambda: not controls.legends.visible)
 
 

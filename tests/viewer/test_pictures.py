@@ -9,8 +9,9 @@ from PIL import Image
 from shared import value_error
 
 from gaussian_swaying.geometry.rotations import rotation_to_quat
-from gaussian_swaying.simulation.draw import draw_wind
-from gaussian_swaying.viewer.pictures import SHOWN, FilmStrip, PictureSize, camera_of, draw, enlarged, under_cursor
+from gaussian_swaying.rendering.passes import PASSES
+from gaussian_swaying.simulation.draw import View
+from gaussian_swaying.viewer.pictures import FilmStrip, PictureSize, camera_of, draw, enlarged, under_cursor
 
 
 def _pose(session):
@@ -31,6 +32,9 @@ def test_the_picture_is_that_of_the_simulation(session):
     assert difference.max() < 2.0  # one half by rounding, and the camera in float32
 
 
+SHOWN = [name for name, own in PASSES.items() if not own.air]
+
+
 @pytest.mark.parametrize("shown", SHOWN)
 def test_everything_that_can_be_shown_is_different(session, shown):
     wxyz, eye, fov, _ = _pose(session)
@@ -41,25 +45,22 @@ def test_everything_that_can_be_shown_is_different(session, shown):
     assert all(np.abs(picture.astype(int) - other.astype(int)).max() > 30 for other in others)
 
 
-@pytest.mark.parametrize("shown", SHOWN)
-def test_streaks_of_air_are_those_of_the_render(session, shown):
-    """Over a paler picture of whatever is shown, as `renders: [wind]` draws them over the colours."""
+def test_streaks_of_air_are_those_of_the_render(session):
+    """Over the paler picture."""
     wxyz, eye, fov, camera = _pose(session)
     small = camera_of(wxyz, eye, fov, 192, 108)
-    with_air, without = (draw(session.snapshot, small, shown, streaks=air).astype(int) for air in (True, False))
+    with_air, without = (draw(session.snapshot, small, shown).astype(int) for shown in ("wind", "color"))
     drawn = np.abs(with_air - (0.75 * without + 0.25 * 255)).max(-1) > 3
     assert 0.02 < drawn.mean() < 0.8
-    if shown == "colour":
-        simulation, state = session.snapshot.simulation, session.snapshot.state
-        with torch.inference_mode():
-            rendered = simulation.painter.render(state, 0)
-            wanted = draw_wind(simulation.stepper, state, camera, rendered)
-        found = draw(session.snapshot, camera_of(wxyz, eye, fov, camera.width, camera.height), streaks=True)
-        apart = np.abs(found.astype(float) - 255 * wanted.clamp(0, 1).numpy()).max(-1)
-        assert (apart > 2.0).mean() < 1e-3  # the camera in float32: the ends of a few streaks
+    painter, state = session.snapshot.simulation.painter, session.snapshot.state
+    with torch.inference_mode():
+        wanted = View(painter, state, painter.deformed(state), camera).wind()
+    found = draw(session.snapshot, camera_of(wxyz, eye, fov, camera.width, camera.height), "wind")
+    apart = np.abs(found.astype(float) - 255 * wanted.clamp(0, 1).numpy()).max(-1)
+    assert (apart > 2.0).mean() < 1e-3  # the camera in float32: the ends of a few streaks
 
 
-@pytest.mark.parametrize("shown", ["normals", "wind force"])
+@pytest.mark.parametrize("shown", ["normal", "force"])
 def test_edges_of_passes_fade(session, shown):
     """Between the object and the black around it some pixels are in between; a hard edge has none."""
     wxyz, eye, fov, camera = _pose(session)

@@ -108,8 +108,7 @@ def test_a_browser_that_draws_gets_no_pictures(page, drawer):
 
     assert pictures() == 0
     for begin, end in (
-        (lambda: setattr(page, "shown", "normals"), lambda: setattr(page, "shown", "colour")),
-        (lambda: setattr(page, "streaks", True), lambda: setattr(page, "streaks", False)),
+        (lambda: setattr(page, "shown", "normal"), lambda: setattr(page, "shown", "color")),
         (lambda: setattr(page, "by_browser", False), lambda: setattr(page, "by_browser", True)),
     ):
         begin()

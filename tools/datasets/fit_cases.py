@@ -144,7 +144,7 @@ def shared_scene(pattern: Any, video: FitVideo, law: str, folder: str) -> dict[s
         "wind": {"flow": START["flow"], "modulations": []},
         "aero": {"C_D": pattern.drag, "C_F": 0.0, "C_L": 0.0, "air_density": pattern.air_density, "law": law},
         "shader": {"class_path": "DiffuseShader", "init_args": shader},
-        "camera": {"class_path": "TransformsCamera", "init_args": {"path": f"{folder}/transforms.json", "frame": 0}},
+        "camera": {"class_path": "CaptureCamera", "init_args": {"path": f"{folder}/transforms.json", "view": 0}},
     }
 
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
-from gaussian_swaying._checks import check_positive, check_vector, check_whole
+from gaussian_swaying._checks import check_positive, check_vector
 from gaussian_swaying._fixed import Fixed
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.origin import NO_ORIGIN, Origin
@@ -24,7 +23,6 @@ from gaussian_swaying.rendering.cameras.camera import (
     look_at_camera,
     orbit_camera,
 )
-from gaussian_swaying.rendering.cameras.transforms_json import camera_from_transforms
 
 
 class CameraPath(Fixed, ABC):
@@ -197,42 +195,3 @@ class LookAtCamera(PinholePath):
     def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
         """Camera of a frame, see :meth:`CameraPath.__call__`."""
         return look_at_camera(self.eye, self.target, up if self.up is None else self.up, **self.picture(center))
-
-
-@dataclass(eq=False)
-class TransformsCamera(CameraPath):
-    """Captured camera of a ``transforms.json``; the file is read at the first frame.
-
-    Args:
-        path: The file, see :func:`camera_from_transforms`.
-        frame: Index of the camera in the file, from 0. It is the same camera in every frame of the video.
-        width: Image width [pixels]; by default that of the file.
-        height: Image height [pixels]; by default that of the file.
-        near: Near plane [scene units]; a hundredth of the distance or of the object's size when None.
-
-    Raises:
-        TypeError: If an argument has the wrong type.
-        ValueError: If a number is out of range; at the first frame, if the file is bad.
-    """
-
-    captured = True
-    still = True
-
-    path: str | Path
-    frame: int = 0
-    _: KW_ONLY
-    width: int | None = None
-    height: int | None = None
-    near: float | None = None
-
-    def __post_init__(self) -> None:
-        check_whole("frame", self.frame, 0)
-        check_picture(self)
-        self._camera: Camera | None = None
-
-    def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
-        """Camera of a frame, see :meth:`CameraPath.__call__`."""
-        if self._camera is None:
-            near = self.near_of(size)
-            self._camera = camera_from_transforms(self.path, self.frame, self.width, self.height, near, self._origin)
-        return self._camera.to(center.device, center.dtype)

@@ -10,43 +10,9 @@ from torch import Tensor
 from gaussian_swaying._inputs import read_json
 from gaussian_swaying._numbers import sense_of
 from gaussian_swaying.geometry.origin import NO_ORIGIN, Origin
-from gaussian_swaying.rendering.cameras.camera import Camera, check_pixels, counted_pose, resized_intrinsics
+from gaussian_swaying.rendering.cameras.camera import Camera, counted_pose, resized_intrinsics
 
 _AXES = {"opengl": [1.0, -1.0, -1.0, 1.0], "opencv": [1.0, 1.0, 1.0, 1.0]}  # signs of their x, y, z in those of OpenCV
-
-
-def camera_from_transforms(
-    path: str | Path,
-    frame: int,
-    width: int | None = None,
-    height: int | None = None,
-    near: float = 0.01,
-    origin: Origin = NO_ORIGIN,
-) -> Camera:
-    """Read one camera of a ``transforms.json`` in the NeRF, Blender or instant-ngp style.
-
-    ``transform_matrix`` is camera-to-world with OpenGL axes (x right, y up, z backward), or with those of OpenCV (x
-    right, y down, z forward) if the file has ``"axes": "opencv"`` at its top. The intrinsics come from
-    ``fl_x``, ``fl_y``, ``cx``, ``cy``, ``w`` and ``h`` [pixels], or from ``camera_angle_x`` [radians]; a value inside
-    the frame takes precedence over one at the top of the file. If ``cx`` and ``cy`` are missing, the image centre is
-    used. If ``fl_y`` is missing, it comes from ``camera_angle_y``, or pixels are square. Lens distortion (``k1``,
-    ``p1``, ...) is ignored: undistort the images first.
-
-    Args:
-        path: The file.
-        frame: Index in its list ``frames``, from 0.
-        width: Width of the image to render [pixels]; the intrinsics are rescaled. By default that of the file, or
-            the one that keeps the file's aspect ratio when only ``height`` is given.
-        height: Height of the image to render [pixels], with the same defaults.
-        near: Near plane [scene units].
-        origin: Point of the file from which places count.
-
-    Returns:
-        The camera, in the default precision of torch.
-    """
-    if isinstance(frame, bool) or not isinstance(frame, int):
-        raise TypeError(f"Expected `frame` to be a whole number, but got {frame!r}.")
-    return camera_of_transforms(path, load_transforms(path), frame, width, height, near, origin)
 
 
 def camera_of_transforms(
@@ -58,15 +24,30 @@ def camera_of_transforms(
     near: float = 0.01,
     origin: Origin = NO_ORIGIN,
 ) -> Camera:
-    """One camera of a ``transforms.json`` that :func:`load_transforms` has read; see :func:`camera_from_transforms`."""
+    """One camera of a ``transforms.json`` in the NeRF, Blender or instant-ngp style.
+
+    ``transform_matrix`` is camera-to-world with OpenGL axes (x right, y up, z backward), or with those of OpenCV (x
+    right, y down, z forward) if the file has ``"axes": "opencv"`` at its top. The intrinsics come from
+    ``fl_x``, ``fl_y``, ``cx``, ``cy``, ``w`` and ``h`` [pixels], or from ``camera_angle_x`` [radians]; a value inside
+    the frame takes precedence over one at the top of the file. If ``cx`` and ``cy`` are missing, the image centre is
+    used. If ``fl_y`` is missing, it comes from ``camera_angle_y``, or pixels are square. Lens distortion (``k1``,
+    ``p1``, ...) is ignored: undistort the images first.
+
+    Args:
+        path: The file.
+        data: What :func:`load_transforms` has read.
+        frame: Index in its list ``frames``, from 0.
+        width: Width of the image to render [pixels]; the intrinsics are rescaled. By default that of the file, or
+            the one that keeps the file's aspect ratio when only ``height`` is given.
+        height: Height of the image to render [pixels], with the same defaults.
+        near: Near plane [scene units].
+        origin: Point of the file from which places count.
+
+    Returns:
+        The camera, in the default precision of torch.
+    """
     where = f"`{path}`"
-    frames = data["frames"]
-    if not 0 <= frame < len(frames):
-        raise ValueError(f"The camera file {where} has no frame {frame}: set `frame` between 0 and {len(frames) - 1}.")
-    for name, size in (("width", width), ("height", height)):
-        if size is not None:
-            check_pixels(name, size)
-    pixels = read_intrinsics(where, {**data, **frames[frame]}, width, height)
+    pixels = read_intrinsics(where, {**data, **data["frames"][frame]}, width, height)
     intrinsics, width, height = resized_intrinsics(*pixels, width, height)
     world_to_camera = counted_pose(torch.linalg.inv(read_pose(where, data, frame)), origin)
     return Camera(world_to_camera, intrinsics, width, height, near).to(dtype=torch.get_default_dtype())
