@@ -1,8 +1,12 @@
-"""What a run is made of stays as it was made, and the record of a run says what ran."""
+"""Components stay as they were made, a run's record says what ran, and a wrong argument is refused in a sentence."""
 
 import copy
 import inspect
+import math
+import traceback
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -11,6 +15,7 @@ from shared import up_to
 import gaussian_swaying
 from gaussian_swaying import (
     AeroForce,
+    Box,
     Contact,
     Copy,
     Cylinder,
@@ -22,6 +27,7 @@ from gaussian_swaying import (
     Live,
     LookAtCamera,
     Material,
+    MaterialPoints,
     MPMSolver,
     OrbitCamera,
     PhongShader,
@@ -29,6 +35,8 @@ from gaussian_swaying import (
     PinnedRegion,
     Recorder,
     Scene,
+    SimFrame,
+    Simulation,
     SineSway,
     Sphere,
     UniformGust,
@@ -48,38 +56,47 @@ from gaussian_swaying.wind.turbulence import Turbulence
 
 POLE = up_to(x=0.11)
 FLAG = FlagScene(spacing=0.1)
+ZERO, UNIT = [0.0, 0.0, 0.0], [1.0, 1.0, 1.0]
+BOX, CLOUD = Box(ZERO, UNIT), FLAG.generate()
+POINTS = {"position": torch.eye(3), "volume": 1.0, "density": 1.0, "youngs_modulus": 1.0, "poisson_ratio": 0.3}
+PATCH = {"aero": AeroForce(), "wind": WindField(), "normal": torch.eye(3)[2:], "area": torch.ones(1)}
+GIVEN = [
+    *((kind, {}) for kind in (Material, Copy, Recorder, Contact, WindField, SineSway, UniformGust, GaussianGust)),
+    *(
+        (kind, {})
+        for kind in (AeroForce, MPMSolver, OrbitCamera, DiffuseShader, PhongShader, FlagScene, Sand, Turbulence)
+    ),
+    *((kind, {"region": BOX}) for kind in (PinnedRegion, MaterialRegion)),
+    (Box, {"min": ZERO, "max": UNIT}),
+    (Sphere, {"center": ZERO, "radius": 1.0}),
+    (Cylinder, {"center": ZERO, "axis": UNIT, "radius": 1.0, "height": 1.0}),
+    (Edit, {"E": 1.0}),
+    (Turbulence, {"cells": [8, 8, 8]}),
+    (PinnedPoints, {"at": [ZERO]}),
+    (LookAtCamera, {"eye": ZERO, "target": UNIT}),
+    (Scene, {"generator": FLAG}),
+    (Part, {"name": "leaf"}),
+    (Parts, {"labels": [0] * 4, "parts": [Part("leaf")]}),
+    (ComputedAir, {"low": ZERO, "high": UNIT}),
+    (SimFrame.fit, {"points": torch.eye(3)}),
+    (MaterialPoints.create, POINTS),
+    (GaussianSurfaceModel, {"cloud": CLOUD}),
+    (WindForce, PATCH),
+    (Simulation, {"scene": FLAG, "device": "cpu"}),
+]
 APART = {"CaptureDataModule", "SimulationDiverged", "SpatialWind", "SplatTrainer"}
 """An abstract class, an error, and those that Lightning assigns to."""
 
 
 def _simulation(**given):
-    return gaussian_swaying.Simulation(FLAG, hold=POLE, wind=[0.0, 4.0, 1.0], device="cpu", **given)
+    return Simulation(FLAG, hold=POLE, wind=[0.0, 4.0, 1.0], device="cpu", **given)
 
 
 def _made():
     simulation = _simulation()
-    cloud, state = FLAG.generate(), simulation.start()
-    normal = torch.tensor([[0.0, 0.0, 1.0]])
-    return [
-        *(simulation, simulation.painter, simulation.model, next(simulation.frames(1)), simulation.scene.frame),
-        *(cloud, state, simulation.solver.points, GaussianSurfaceModel(cloud), FLAG, Scene(generator=FLAG)),
-        *(
-            Live(),
-            Material(),
-            MaterialRegion(POLE),
-            Sand(),
-            Contact(),
-            Copy(),
-            Edit(E=1.0),
-            Recorder(),
-            InteriorFilling(0.1),
-        ),
-        *(WindField(), SineSway(), UniformGust(), GaussianGust(), Turbulence(), ComputedAir([0.0] * 3, [1.0] * 3)),
-        *(AeroForce(), WindForce(AeroForce(), WindField(), normal, torch.ones(1)), MPMSolver(0.1)),
-        *(PinnedRegion(POLE), PinnedPoints([[0.0, 0.0, 0.0]]), POLE, Sphere([0.0] * 3, 1.0)),
-        *(Cylinder([0.0] * 3, [0.0, 0.0, 1.0], 1.0, 1.0), Part("leaf"), Parts([0] * 4, [Part("leaf")])),
-        *(OrbitCamera(), LookAtCamera([0.0, -3.0, 0.0], [0.0] * 3), DiffuseShader(), PhongShader()),
-    ]
+    parts = (simulation.painter, simulation.model, next(simulation.frames(1)), simulation.scene.frame, CLOUD)
+    more = (simulation.start(), simulation.solver.points, Live(), InteriorFilling(0.1))
+    return [simulation, *parts, *more, FLAG, POLE, *(make(**given) for make, given in GIVEN)]
 
 
 def test_nothing_that_is_public_can_be_assigned_or_deleted():
@@ -176,14 +193,14 @@ def _turns(make, count=6):
 
 
 def _with_solver(shared):
-    return lambda which: gaussian_swaying.Simulation(
+    return lambda which: Simulation(
         FlagScene(spacing=0.1 + 0.02 * which), Material(E=[3e3, 3e5][which]), solver=shared, wind=[0.0, 4.0, 1.0]
     )
 
 
 def _with_effect(shared):
     winds = [WindField(flow, effects=[shared]) for flow in ([0.0, 4.0, 0.0], [0.0, 0.0, 4.0])]
-    return lambda which: gaussian_swaying.Simulation(FLAG, hold=POLE, wind=winds[which])
+    return lambda which: Simulation(FLAG, hold=POLE, wind=winds[which])
 
 
 @pytest.mark.parametrize(
@@ -203,3 +220,30 @@ def test_simulations_share_no_part(make, shared):
         assert torch.equal(first, other)
         assert torch.equal(first, third)
     assert alone[0].shape != alone[1].shape or not torch.equal(*alone)
+
+
+WRONG = [
+    *(object(), "x", b"x", {}, [], [1, 2], [None] * 3, ["a", "b", "c"], [[0, 0, 0]], -1, math.nan, 1e30),
+    *(torch.zeros(2), torch.zeros(5, 3), torch.zeros(3, 3, 3).double(), torch.zeros(3).long(), np.zeros(3), None),
+]
+PACKAGE = Path(gaussian_swaying.__file__).parent
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(("make", "given"), GIVEN, ids=lambda value: getattr(value, "__qualname__", ""))
+def test_a_wrong_argument_is_named(make, given):
+    names = [name for name in inspect.signature(make).parameters if name not in ("renderer", "device", "requires_grad")]
+    refused = [error for name in names for wrong in WRONG if (error := _error(make, given | {name: wrong})) is not None]
+    assert len(refused) > len(names)
+    for error in refused:
+        assert isinstance(error, TypeError | ValueError | OSError), error
+        assert Path(traceback.extract_tb(error.__traceback__)[-1].filename).is_relative_to(PACKAGE), error
+        assert "\n" not in str(error)
+
+
+def _error(make, given):
+    try:
+        make(**given)
+    except Exception as error:
+        return error
+    return None
