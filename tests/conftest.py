@@ -58,10 +58,24 @@ def device(request):
     return torch.device(request.param)
 
 
-@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
-def kernel_device(request):
-    """Where kernels run: compiled by LLVM on a CPU, or by Triton on a GPU."""
-    return torch.device(request.param)
+kernel_device = device
+"""Where kernels run: compiled by LLVM on a CPU, or by Triton on a GPU."""
+
+
+@pytest.fixture(scope="session")
+def parser():
+    """The parser of the command line."""
+    from gaussian_swaying.simulation.simulation import Simulation
+
+    return Simulation.parser()
+
+
+@pytest.fixture
+def use_threads():
+    """``torch.set_num_threads``, undone afterwards."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])

@@ -1,6 +1,9 @@
 """What tests of several rooms share: draws, material, a small flag, the files of a folder, how a command refuses."""
 
+import math
+import struct
 import warnings
+import zlib
 from contextlib import contextmanager
 
 import pytest
@@ -199,3 +202,19 @@ def alike(found, expected, share):
 def near(found, expected, within):
     """The two differ by no more than an absolute bound."""
     assert_close(found, expected, rtol=0, atol=within)
+
+
+def png(width, height, pixels=b""):
+    """A PNG file whose header may promise more than there is."""
+
+    def chunk(name, data):
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(pixels)) + chunk(b"IEND", b"")
+
+
+def turned_by(degrees):
+    """The rotation about z, float64."""
+    s, c = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
+    return double([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

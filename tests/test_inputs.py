@@ -3,10 +3,10 @@
 import os
 import struct
 import zipfile
-import zlib
 
 import numpy as np
 import pytest
+from shared import png
 
 from gaussian_swaying._inputs import check_archive, check_regular, read_json
 from gaussian_swaying.captures.images import image_size
@@ -86,18 +86,10 @@ def test_an_archive_that_swells_is_refused(tmp_path):
 
 def test_a_picture_that_swells_is_refused(tmp_path):
     """A header of 60,000 x 60,000 pixels in a hundred bytes."""
-
-    def chunk(name, data):
-        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-
-    def picture(width, height):
-        header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-        return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
-
     path = tmp_path / "photo.png"
     for side in (60_000, 10_000):
-        path.write_bytes(picture(side, side))
+        path.write_bytes(png(side, side))
         with pytest.raises(ValueError, match=r"photo.png"):
             image_size(path)
-    path.write_bytes(picture(400, 300))
+    path.write_bytes(png(400, 300))
     assert image_size(path) == (400, 300)

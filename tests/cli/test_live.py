@@ -24,11 +24,6 @@ from gaussian_swaying.viewer import controls
 from gaussian_swaying.viewer.controls import settings_of_splat
 
 
-@pytest.fixture(scope="module")
-def parser():
-    return Simulation.parser()
-
-
 def test_options_and_scene_come_in_any_order(parser):
     own, port = ["--device", "cpu", "--wind.flow", "[1,-2,3]", "--solver.damping", "-3", "--resume"], ["--port", "9000"]
     for line in (

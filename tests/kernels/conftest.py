@@ -1,7 +1,6 @@
 """What tests of the compiler of kernels share."""
 
 import pytest
-import torch
 
 from gaussian_swaying.kernels import cpu
 
@@ -12,11 +11,3 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setattr(cpu, "cache_folder", lambda: tmp_path / "kernels")
     monkeypatch.setattr(cpu, "_COMPILED", {})
     return tmp_path / "kernels"
-
-
-@pytest.fixture
-def use_threads():
-    """``torch.set_num_threads``, undone afterwards."""
-    before = torch.get_num_threads()
-    yield torch.set_num_threads
-    torch.set_num_threads(before)

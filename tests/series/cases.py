@@ -6,14 +6,12 @@ import json
 import os
 import random
 import shutil
-import struct
 import tempfile
-import zlib
 from pathlib import Path
 
 import yaml
 from damage import changed, damaged
-from shared import SMALL, words
+from shared import SMALL, png, words
 from small_captures import arc, write_colmap, write_transforms
 
 ROOT = Path(__file__).parents[2]
@@ -79,16 +77,6 @@ def yaml_case(rng, folder):
     return ["sim", "--config", str(folder / "bad.yaml"), "--device", "cpu", "--output", "run"]
 
 
-def _png(side):
-    """A picture of a few bytes that announces any size."""
-
-    def chunk(name, data):
-        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-
-    header, pixels = struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0), zlib.compress(bytes(10_000_000))
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
-
-
 def capture_case(rng, folder):
     """Most are read with all pictures, some trained for a step."""
     poses, names = arc(4), [f"images/{k}.png" for k in range(4)]
@@ -102,7 +90,7 @@ def capture_case(rng, folder):
     kind = rng.random()
     if path.suffix == ".png" and kind < 0.4:
         side = rng.choice((1, 9000, 13_000, 60_000, 2**31 - 1))
-        path.write_bytes(_png(side))
+        path.write_bytes(png(side, side, bytes(10_000_000)))
         if texts[0].name == "transforms.json" and rng.random() < 0.7:  # the camera agrees
             texts[0].write_text(json.dumps(json.loads(texts[0].read_text()) | {"w": side, "h": side}))
     elif path.suffix == ".json" and kind < 0.6:

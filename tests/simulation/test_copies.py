@@ -1,6 +1,5 @@
 """One object, many copies: each as a simulation of its own in its own wind, drawn from one splat."""
 
-import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from shared import beyond, double, in_both, near, peak, seeded, up_to, value_error
+from shared import beyond, double, in_both, near, peak, seeded, turned_by, up_to, value_error
 from small_scenes import together
 
 from gaussian_swaying.cli.live import session_of
@@ -86,11 +85,6 @@ def _end(simulation, frames=4):
     return list(simulation.frames(frames))[-1]
 
 
-def _turn(degrees):
-    s, c = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
-    return double([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
 def _gusty(seed=5):
     return WindField([6.0, 1.5, 0.0], modulations=[UniformGust(0.5), GaussianGust(1.0)], seed=seed)
 
@@ -131,14 +125,14 @@ def test_a_turned_copy_in_a_turned_wind_moves_alike(degrees):
         _end(
             _simulation(
                 [Copy([0.3, 0.2, 0.1], angle)],
-                WindField(_turn(angle) @ flow, modulations=[UniformGust(0.5)]),
+                WindField(turned_by(angle) @ flow, modulations=[UniformGust(0.5)]),
                 dtype="float64",
             )
         )
         for angle in (0.0, degrees)
     )
     near(other.state.position, one.state.position, 1e-9)
-    A, shift = _turn(degrees).float(), torch.tensor([0.3, 0.2, 0.1])
+    A, shift = turned_by(degrees).float(), torch.tensor([0.3, 0.2, 0.1])
     a, b = one.gaussians, other.gaussians
     torch.testing.assert_close(b.means[:10], a.means[:10])  # what does not move
     moved = (a.means[10:] - AXIS - shift) @ A.T + AXIS + shift
@@ -271,7 +265,7 @@ def test_a_held_part_belongs_to_the_copy_and_a_still_one_does_not():
     turned = (rest[held] - middle) * torch.tensor([-1.0, -1.0, 1.0]) + middle + torch.tensor([0.0, 2.0, 0.0])
     near(means[1, -int(held.sum()) :], turned, 1e-5)
     view = turned - row.painter.camera_at(0).position
-    seen = sh_to_color(rotate_sh(_coloured().sh[held], _turn(180.0).float()), view)
+    seen = sh_to_color(rotate_sh(_coloured().sh[held], turned_by(180.0).float()), view)
     near(colours[1, -int(held.sum()) :], seen, 2e-5)
 
 
@@ -282,10 +276,10 @@ def test_harmonics_turn_with_the_copy(shader):
     frame = next(simulation.frames(1))
     gaussians, painter, scene = frame.gaussians, simulation.painter, simulation.scene
     view = gaussians.means - painter.camera_at(0).position
-    colours = sh_to_color(rotate_sh(scene.model.sh[:96], _turn(90.0).float()), view[10:])
+    colours = sh_to_color(rotate_sh(scene.model.sh[:96], turned_by(90.0).float()), view[10:])
     if shader is not None:
         normals = scene.model.normals()[:96]
-        colours = shader(colours, normals @ _turn(90.0).float().T, rest_normal=normals)
+        colours = shader(colours, normals @ turned_by(90.0).float().T, rest_normal=normals)
     near(gaussians.colors[10:], colours, 2e-5)
     torch.testing.assert_close(gaussians.colors[:10], sh_to_color(scene.model.sh[96:], view[:10]))
 

@@ -33,11 +33,6 @@ NAMES = [name.replace("*", str(PLACES.get(name.split(".")[-1], 0))) for name in 
 
 
 @pytest.fixture
-def parser():
-    return Simulation.parser()
-
-
-@pytest.fixture
 def config(tmp_path):
     path = tmp_path / "base.yaml"
     path.write_text(yaml.safe_dump(CONFIG))

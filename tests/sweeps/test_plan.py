@@ -10,16 +10,10 @@ from shared import value_error
 
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps import plan as plan_module
 from gaussian_swaying.sweeps.plan import Sweep, make_plan, parse_run, read_sweep
 
 ROOT = Path(__file__).parents[2]
-
-
-@pytest.fixture(scope="module")
-def parser():
-    return Simulation.parser()
 
 
 def test_a_plan(tmp_path, sweep_file, parser):

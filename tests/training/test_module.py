@@ -35,13 +35,18 @@ def _checkpoints(folder, every=10, **options):
     return ModelCheckpoint(dirpath=folder, every_n_train_steps=every, save_top_k=-1, filename="{step}", **options)
 
 
+def _learned(trainer, module, data):
+    """What is validated before and after."""
+    start = trainer.validate(module, data, verbose=False)[0]
+    trainer.fit(module, data)
+    return start, trainer.validate(module, data, verbose=False)[0]
+
+
 def test_a_training_learns(data, make_trainer, tmp_path):
     """More than 6 dB in 200 images on held-out views, with Gaussians that multiply and become flat."""
     module = _module(densification=DefaultDensification(start=20, every=50, grow_grad2d=5e-4), sh_every=100)
     trainer = make_trainer(200, limit_val_batches=1.0, val_check_interval=100, num_sanity_val_steps=0)
-    start = trainer.validate(module, data, verbose=False)[0]
-    trainer.fit(module, data)
-    end = trainer.validate(module, data, verbose=False)[0]
+    start, end = _learned(trainer, module, data)
     assert end["val/psnr"] >= start["val/psnr"] + 6.0
     assert end["val/ssim"] > start["val/ssim"]
     assert trainer.global_step == 200
@@ -249,9 +254,7 @@ def test_a_training_on_a_gpu(kind, data, make_trainer, tmp_path):
     callbacks = [_checkpoints(tmp_path, every=100)]
     on_gpu = {"accelerator": "gpu", "devices": 1, "limit_val_batches": 1.0, "val_check_interval": 1000}
     trainer = make_trainer(200, enable_checkpointing=True, callbacks=callbacks, **on_gpu)
-    start = trainer.validate(module, data, verbose=False)[0]
-    trainer.fit(module, data)
-    end = trainer.validate(module, data, verbose=False)[0]
+    start, end = _learned(trainer, module, data)
     assert end["val/psnr"] > start["val/psnr"] + 3.0
     assert len(module.splat) != data.points
     module.cpu().render(data.held_out[0]["camera"])

@@ -5,7 +5,6 @@ import threading
 import pytest
 from browsers import listened, until
 
-from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.session import Session
 
 SMALL = [
@@ -22,11 +21,6 @@ SMALL = [
 FLAGS = ["--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"]
 FLAGS += ["--disable-component-update", "--disable-sync"]
 DRAWN = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-
-
-@pytest.fixture(scope="session")
-def parser():
-    return Simulation.parser()
 
 
 @pytest.fixture

@@ -233,15 +233,12 @@ def test_material_of_parts_is_that_of_a_run(parser, settings, tmp_path):
     file.write_text(yaml.safe_dump(yaml.safe_load(config_text(parser, settings)) | {"edits": [edit]}))
     session = Session(parser, parser.parse_args(["--config", str(file), "--device=cpu"]))
 
-    def stiffest():
-        return float(session.simulation.scene.points.youngs_modulus.amax())
-
-    assert stiffest() < 1e4
+    assert _stiffness(session) < 1e4
     session.start()
-    until(lambda: stiffest() == pytest.approx(5e4))
+    until(lambda: _stiffness(session) == pytest.approx(5e4))
     session.change({"material.E": 2e4})
     until(lambda: session.settings.material.E == 2e4)
-    until(lambda: session.snapshot.health.time > 0.15 and stiffest() == pytest.approx(5e4))
+    until(lambda: session.snapshot.health.time > 0.15 and _stiffness(session) == pytest.approx(5e4))
     session.close()
     assert session.problem is None
 

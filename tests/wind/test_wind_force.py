@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from shared import EYE, double, in_both, near, peak, rand, seeded, solid, unit, value_error
+from shared import EYE, double, in_both, near, peak, rand, seeded, solid, turned_by, unit, value_error
 from torch.testing import assert_close
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -141,11 +141,6 @@ def test_shapes_are_checked():
             WindForce(AeroForce(), wind, *patches)
 
 
-def _turn(degrees):
-    s, c = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
-    return double([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
 class Whirl(SpatialWind):
     """Air that turns about the origin."""
 
@@ -155,7 +150,7 @@ class Whirl(SpatialWind):
 
 def _blown(winds, turn, shift, delay):
     """The wind at five points of two copies, and its force."""
-    turns = torch.stack([_turn(0.0), turn])
+    turns = torch.stack([turned_by(0.0), turn])
     places = torch.nn.Module()
     vars(places).update(turn=turns, shift=double([[0.0] * 3, shift]), delay=double([0.0, delay]))
     load = WindForce(AeroForce(), winds, EYE[2:].expand(5, 3), torch.ones(5), places)
@@ -165,18 +160,18 @@ def _blown(winds, turn, shift, delay):
 def test_copies_feel_one_wind_turned_and_later():
     """Turned by 90 degrees counterclockwise, their own x axis is y of the scene: wind along y is wind along x."""
     wind = WindField([0.0, 2.0, 0.0], modulations=[UniformGust(0.5)], seed=5)
-    load, _ = _blown(wind.with_seeds([5, 6]), _turn(90.0), [0.0] * 3, 0.7)
+    load, _ = _blown(wind.with_seeds([5, 6]), turned_by(90.0), [0.0] * 3, 0.7)
     found, times = load.winds(double(1.0), 0.3, 4), double(1.0) + 0.3 * torch.arange(4)
     assert found.shape == (4, 2, 1, 3)
     assert torch.equal(found[:, 0, 0], wind(times))
     later = changed(wind, seed=6)(times - 0.7)
-    near(found[:, 1, 0], later @ _turn(90.0), 1e-15)
+    near(found[:, 1, 0], later @ turned_by(90.0), 1e-15)
     assert peak(later[:, 0]) < 1e-12 < 0.9 < found[:, 1, 0, 0].min()
 
 
 @pytest.mark.parametrize("wind", [Whirl(), WindField([4.0, 1.0, 0.0], effects=[Profile(height=2.0, exponent=0.14)])])
 def test_copies_feel_the_wind_at_their_places(wind):
-    turn, shift = _turn(30.0), double([2.0, -1.0, 0.5])
+    turn, shift = turned_by(30.0), double([2.0, -1.0, 0.5])
     load, position = _blown([wind] * 2, turn, shift.tolist(), 0.0)
     now, there = double(2.0), position[1] @ turn.T + shift
     wanted = [wind.at(now, p) if isinstance(wind, WindField) else wind(now, p) for p in (position[0], there)]

@@ -44,22 +44,26 @@ def _turning(point, normal, sizes, scale, along=0.0, **times):
     return {"type": "enforce_particle_velocity_rotation", **shape, **speeds, **REST, **times}
 
 
+def _released(first, last, layers):
+    ends = {"start_position": first, "end_position": last, "start_time": 0.0, "end_time": 1.5}
+    return {"type": "release_particles_sequentially", "normal": [1, 0, 0], "num_layers": layers, **ends}
+
+
 def _filled(n_grid, density, search=1, **more):
     return {"n_grid": n_grid, "density_threshold": density, "search_threshold": search, **more}
 
 
 # Values that PhysGaussian published for its six example scenes. Where its boxes stand matters to none of these tests,
 # and is ours for plane, tear_bread, vasedeck (but for the height of its pin) and pillow2sofa.
+USUAL = {"material": "jelly", "nu": 0.3, "substep_dt": 1e-4, "g": STILL}
 PUBLISHED = {
-    "ficus": {
-        "material": "jelly",
+    "ficus": USUAL
+    | {
         "E": 2e6,
         "nu": 0.4,
         "density": 200,
-        "substep_dt": 1e-4,
         "frame_dt": 0.04,
         "frame_num": 125,
-        "g": [0, 0, 0],
         "grid_v_damping_scale": 0.9999,
         "additional_material_params": [
             {"point": [1, 1, 1.5], "size": [1, 1, 0.5], "E": 2e6, "nu": 0.4, "density": 70},
@@ -69,11 +73,11 @@ PUBLISHED = {
             {"type": "particle_impulse", "force": [-0.18, 0, 0], "num_dt": 1, "start_time": 0},
         ],
     },
-    "wolf": {
+    "wolf": USUAL
+    | {
         "material": "sand",
         "friction_angle": 30,
         "E": 5e7,
-        "nu": 0.3,
         "density": 2000,
         "n_grid": 200,
         "substep_dt": 2e-5,
@@ -91,28 +95,18 @@ PUBLISHED = {
                 "friction": 0.0,
                 **REST,
             },
-            {
-                "type": "release_particles_sequentially",
-                "normal": [1, 0, 0],
-                "start_position": 1.5,
-                "end_position": 0.5,
-                "num_layers": 50,
-                "start_time": 0.0,
-                "end_time": 1.5,
-            },
+            _released(1.5, 0.5, 50),
         ],
     },
-    "plane": {
+    "plane": USUAL
+    | {
         "material": "metal",
         "yield_stress": 100,
         "E": 1e5,
-        "nu": 0.3,
         "density": 1000,
         "n_grid": 120,
-        "substep_dt": 1e-4,
         "frame_dt": 0.01,
         "frame_num": 400,
-        "g": [0, 0, 0],
         "rotation_degree": [45.0, 6.5],
         "rotation_axis": [1, 2],
         "sim_area": [-2, 0, -1, 1, -1, 1],
@@ -125,16 +119,13 @@ PUBLISHED = {
             _turning([0.7, 1, 1], [1, 0, 0], [0.1, 0.5], -1.0, start_time=1.0, end_time=2.0),
         ],
     },
-    "tear_bread": {
-        "material": "jelly",
+    "tear_bread": USUAL
+    | {
         "E": 2e3,
-        "nu": 0.3,
         "density": 200,
         "n_grid": 150,
-        "substep_dt": 1e-4,
         "frame_dt": 0.01,
         "frame_num": 300,
-        "g": [0, 0, 0],
         "rotation_degree": [25.0],
         "rotation_axis": [1],
         "scale": 0.6,
@@ -143,16 +134,13 @@ PUBLISHED = {
         "particle_filling": _filled(100, 100, 0.2, smooth=True, visualize=True),
         "boundary_conditions": [_pulled([1, 1 + side * 0.25, 1], [1, 0.1, 1], [0, side * 0.2, 0]) for side in (1, -1)],
     },
-    "vasedeck": {
-        "material": "jelly",
+    "vasedeck": USUAL
+    | {
         "E": 1e4,
-        "nu": 0.3,
         "density": 40,
         "n_grid": 120,
-        "substep_dt": 1e-4,
         "frame_dt": 0.04,
         "frame_num": 75,
-        "g": [0, 0, 0],
         "rotation_degree": [135.0],
         "rotation_axis": [0],
         "sim_area": [-2.25, 2.25, -5.01, -0.81, -1.95, 2.55],
@@ -166,13 +154,11 @@ PUBLISHED = {
             _pulled([1, 1.44, 1], [1, 0.1, 1]),
         ],
     },
-    "pillow2sofa": {
-        "material": "jelly",
+    "pillow2sofa": USUAL
+    | {
         "E": 1e4,
-        "nu": 0.3,
         "density": 2000,
         "n_grid": 100,
-        "substep_dt": 1e-4,
         "frame_dt": 0.02,
         "frame_num": 300,
         "g": [0, 0, -5],
@@ -507,16 +493,7 @@ def test_planes_are_what_they_are_named_unless_asked(tmp_path):
 @pytest.mark.parametrize(("first", "last"), [(1.5, 0.5), (0.6, 1.3)])
 def test_the_front_follows_physgaussians_layers(first, last, tmp_path):
     """Against the boxes that PhysGaussian takes away one after the other; a layer leaves within its own time."""
-    condition = {
-        "type": "release_particles_sequentially",
-        "normal": [1, 0, 0],
-        "start_position": first,
-        "end_position": last,
-        "num_layers": 7,
-        "start_time": 0.0,
-        "end_time": 1.5,
-    }
-    (release,) = _one(condition, tmp_path)
+    (release,) = _one(_released(first, last, 7), tmp_path)
     assert isinstance(release, SequentialRelease)
     along = first + (last - first) * torch.linspace(0.01, 0.99, 197, dtype=torch.float64)
     points = torch.stack([along, torch.full_like(along, 0.3), torch.full_like(along, 1.7)], -1)

@@ -355,14 +355,6 @@ CASES = {
 }
 
 
-@pytest.fixture
-def use_threads():
-    """``torch.set_num_threads``, undone afterwards."""
-    before = torch.get_num_threads()
-    yield torch.set_num_threads
-    torch.set_num_threads(before)
-
-
 def _end(case, dtype):
     """Of two rollouts, of which the second one is replayed, by a solver of its own."""
     generator = seeded(0)
