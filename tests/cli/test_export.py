@@ -45,7 +45,7 @@ def test_usd_as_given(flag, tmp_path, capsys):
         (["a.splat", "--up", "0", "0", "1"], "--up and --metres-per-unit are only for USD and glTF"),
         (["a.splat", "--spz-version=4"], "--spz-version is only for .spz files: leave it out"),
         (["a.splat", "--apart"], "--apart is only for the frames of a run"),
-        (["--web", "--spz-version=4"], "--spz-version is not for --web"),
+        (["--web", "--spz-version=4"], "--spz-version is not for a film"),
     ],
 )
 def test_bad_options(options, message, flag, tmp_path, capsys):
