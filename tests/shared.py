@@ -1,5 +1,6 @@
 """What tests of several rooms share: draws, material, a small flag, the files of a folder, how a command refuses."""
 
+import csv
 import math
 import struct
 import warnings
@@ -218,3 +219,9 @@ def turned_by(degrees):
     """The rotation about z, float64."""
     s, c = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
     return double([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def rows(path):
+    """The rows of a table, as text by the names of columns."""
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))

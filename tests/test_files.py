@@ -1,10 +1,10 @@
 """Files that appear whole or not at all."""
 
-import csv
 import json
 import math
 
 import pytest
+from shared import rows
 
 from gaussian_swaying._files import atomic, check_page, write_json, write_table
 
@@ -38,8 +38,7 @@ def test_numbers_that_json_does_not_have_are_null(tmp_path):
 
 def test_rows_of_an_older_run_leave_their_gaps(tmp_path):
     write_table(tmp_path / "table.csv", [{"a": 1}, {"a": 2, "b": 3}])
-    with (tmp_path / "table.csv").open(newline="") as file:
-        assert list(csv.DictReader(file)) == [{"a": "1", "b": ""}, {"a": "2", "b": "3"}]
+    assert rows(tmp_path / "table.csv") == [{"a": "1", "b": ""}, {"a": "2", "b": "3"}]
 
 
 def test_a_page_needs_its_name_and_a_folder(tmp_path):

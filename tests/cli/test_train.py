@@ -1,6 +1,5 @@
 """tools/train.py: the shipped configurations, a whole run on a CPU, and bad input."""
 
-import csv
 import logging
 import os
 import shlex
@@ -14,7 +13,7 @@ import torch
 import yaml
 from damage import Fuse
 from lightning.pytorch.utilities.rank_zero import rank_zero_info, rank_zero_warn
-from shared import contents, value_error, words
+from shared import contents, rows, value_error, words
 
 from gaussian_swaying.captures.generated_capture import GeneratedCapture
 from gaussian_swaying.cli.train import main, make_cli
@@ -93,8 +92,7 @@ def test_a_second_run_in_the_same_folder_keeps_its_own_last_state(capture, tmp_p
 
 
 def _rows(folder):
-    with (folder / "csv/metrics.csv").open(newline="") as file:
-        return list(csv.DictReader(file))
+    return rows(folder / "csv/metrics.csv")
 
 
 @pytest.fixture
@@ -183,12 +181,12 @@ def test_a_refused_training_changes_nothing(capture, tmp_path, capsys):
     lock.release()
     assert contents(tmp_path) == before
     # looking at it adds to its log
-    rows = _rows(folder)
+    kept = _rows(folder)
     capsys.readouterr()
     assert main(["validate", *_arguments(capture, folder), f"--ckpt_path={last}"]) == 0
     assert f"wrote {folder}/csv\n" in capsys.readouterr().out
     *old, new = _rows(folder)
-    assert [{name: row[name] for name in rows[0]} for row in old] == rows
+    assert [{name: row[name] for name in kept[0]} for row in old] == kept
     assert float(new["val/psnr"]) > 0
     assert (folder / "csv/config.yaml").read_bytes() == before[folder / "csv/config.yaml"]
 

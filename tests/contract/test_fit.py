@@ -1,9 +1,9 @@
 """Wind and stiffness are found from a short film of half a second, seen by two cameras, with noise."""
 
-import csv
 import json
 
 import pytest
+from shared import rows
 from small_films import TRUTH
 
 from gaussian_swaying import Simulation, fit
@@ -28,10 +28,9 @@ def test_own_data_with_noise(own, tmp_path, capsys):
     for shown in result.shown:
         assert shown.fitted > 35
         assert shown.predicted > 35
-    with (tmp_path / "fit/values.csv").open() as file:
-        rows = {row["name"]: row for row in csv.DictReader(file)}
-    assert float(rows["material.E"]["value"]) == values["material.E"]
-    assert float(rows["wind.speed"]["standard_error"]) == result.errors["wind.speed"] > 0
+    found = {row["name"]: row for row in rows(tmp_path / "fit/values.csv")}
+    assert float(found["material.E"]["value"]) == values["material.E"]
+    assert float(found["wind.speed"]["standard_error"]) == result.errors["wind.speed"] > 0
     assert (tmp_path / "fit/pictures/left.png").stat().st_size > 0
     assert json.loads((tmp_path / "fit/result.json").read_text())["not_determined"] == result.vague
     again = Simulation.from_yaml(tmp_path / "fit/scene.yaml", device="cpu")

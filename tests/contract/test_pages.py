@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gaussian_swaying.cli.main import main
-from tests.browsers import picture_of, until
+from tests.browsers import asked_of_a_network, listened, picture_of, until
 
 POLE = {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [0.11, None, None]}}
 PIN = {"class_path": "PinnedRegion", "init_args": {"region": POLE}}
@@ -23,11 +23,7 @@ def show(chromium):
         browser = driver.chromium.launch(executable_path=chromium, args=GRAPHICS)
 
         def show(path, ready):
-            page = browser.new_page(viewport={"width": 480, "height": 270})
-            page.told, page.asked = [], []
-            page.on("console", lambda message: page.told.append(message.text))
-            page.on("pageerror", lambda error: page.told.append(str(error)))
-            page.on("request", lambda request: page.asked.append(request.url))
+            page = listened(browser.new_page(viewport={"width": 480, "height": 270}))
             page.goto(path.as_uri())
             page.wait_for_function(ready, timeout=60_000)
             return page
@@ -52,7 +48,7 @@ def check_motion(page, before):
     """The picture changes, nothing went wrong, and nothing was asked of a network."""
     until(lambda: np.abs(picture(page) - before).max() > 20)
     assert page.told == []
-    assert [url for url in page.asked if not url.startswith(("file:", "data:", "blob:"))] == []
+    assert asked_of_a_network(page) == []
 
 
 def test_a_film(show, tmp_path, monkeypatch):

@@ -18,7 +18,7 @@ TESTS = [
     "mpm/kernels/test_agreement.py::test_cells_of_any_size[2048-cpu-('total', [1, 3, 0, 64, 65, 130])]",
     "mpm/kernels/test_agreement.py::test_cells_of_any_size[1-cpu-('updated', [3, 0, 64])]",
     "mpm/kernels/test_agreement.py::test_kernels_do_what_torch_does[cpu: total, corotated, nodes, hinge and clamp]",
-    "mpm/test_adjoint.py::test_gradients_of_a_rollout[cpu-pins of both kinds]",
+    "mpm/kernels/test_adjoint.py::test_gradients_of_a_rollout[cpu-pins of both kinds]",
 ]
 
 

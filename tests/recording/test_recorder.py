@@ -1,6 +1,5 @@
 """What a run leaves on disk, and what it leaves when something breaks."""
 
-import csv
 import gc
 import json
 import os
@@ -14,7 +13,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
-from shared import advanced, near, peak, value_error, without_waits
+from shared import advanced, near, peak, rows, value_error, without_waits
 
 from gaussian_swaying.config.parser import applied
 from gaussian_swaying.gaussians.harmonics import sh_to_color
@@ -97,12 +96,11 @@ def test_files_of_a_run(make_simulation, tmp_path):
 def test_diagnostics_are_a_table_too(make_simulation, tmp_path):
     """One row per frame with the numbers of summary.json, readable by any spreadsheet."""
     summary = _run(make_simulation(), tmp_path / "run")
-    with (tmp_path / "run" / "diagnostics.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == len(summary["per_frame"]) == 3
-    for row, entry in zip(rows, summary["per_frame"], strict=True):
+    table = rows(tmp_path / "run" / "diagnostics.csv")
+    assert len(table) == len(summary["per_frame"]) == 3
+    for row, entry in zip(table, summary["per_frame"], strict=True):
         assert {name: float(value) for name, value in row.items()} == pytest.approx(entry)
-    assert float(rows[-1]["wind_work"]) > 0
+    assert float(table[-1]["wind_work"]) > 0
 
 
 def test_what_is_switched_off_is_not_written(make_simulation, tmp_path):

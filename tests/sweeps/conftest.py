@@ -1,6 +1,5 @@
 """Sweeps of tiny flags: as a file, done once without disturbance, and with workers that are killed."""
 
-import csv
 import multiprocessing
 from pathlib import Path
 
@@ -26,11 +25,6 @@ def write_sweep(path, axes=AXES, draws=2, settings=None, **more):
     fields = {"base": str(FLAG), "settings": SMALL | {"frames": 12} | (settings or {}), "axes": axes, "draws": draws}
     path.write_text(yaml.safe_dump(fields | more, sort_keys=False))
     return path
-
-
-def rows(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 @pytest.fixture(scope="session")

@@ -7,13 +7,12 @@ import tarfile
 import numpy as np
 import pytest
 from PIL import Image
+from shared import rows
 
 from gaussian_swaying.cli.sweep import main
 from gaussian_swaying.sweeps import record
 from gaussian_swaying.sweeps.dataset import SweepDataset, write_shards
 from gaussian_swaying.sweeps.record import write_parquet
-
-from .conftest import rows
 
 
 def test_parquet(tmp_path):

@@ -7,14 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from shared import advanced, peak
+from shared import advanced, peak, rows
 
 from gaussian_swaying.cli.sweep import main
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.plan import make_plan, read_sweep
 from gaussian_swaying.sweeps.run import Job, members_of
-
-from .conftest import rows
 
 pytestmark = pytest.mark.gpu
 

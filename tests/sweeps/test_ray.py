@@ -7,10 +7,9 @@ import threading
 import time
 
 import pytest
+from shared import rows
 
 from gaussian_swaying.cli.sweep import main
-
-from .conftest import rows
 
 ray = pytest.importorskip("ray")
 pytestmark = pytest.mark.timeout(900)

@@ -9,7 +9,7 @@ import signal
 import numpy as np
 import pytest
 from PIL import Image
-from shared import refused
+from shared import refused, rows
 
 from gaussian_swaying.cli.sweep import explain, main
 from gaussian_swaying.runs.lock import LOCK, FolderLock
@@ -17,8 +17,6 @@ from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps import run
 from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep
 from gaussian_swaying.sweeps.run import Job, do
-
-from .conftest import rows
 
 QUICK = ["--workers", "2", "--device", "cpu"]
 

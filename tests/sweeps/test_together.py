@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from shared import rows
 
 from gaussian_swaying.cli.sweep import main
 from gaussian_swaying.config.parser import config_text
@@ -12,8 +13,6 @@ from gaussian_swaying.simulation.model import in_settings
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep
 from gaussian_swaying.sweeps.run import Job, grouped, members_of, texts
-
-from .conftest import rows
 
 FIXED = {"solver.substep": 2e-3, "frames": 5}
 OPTIONS = ("--workers", "2", "--device", "cpu")

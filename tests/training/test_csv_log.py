@@ -1,15 +1,9 @@
 """Rows of a log are added, never taken away."""
 
-import csv
-
 import pytest
+from shared import rows
 
 from gaussian_swaying.training.csv_log import CsvLog, append_row
-
-
-def _rows(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def test_rows_and_columns_are_added(tmp_path):
@@ -20,7 +14,7 @@ def test_rows_and_columns_are_added(tmp_path):
     one.log_metrics({"loss": 1.5}, 1)
     two.log_metrics({"psnr": 20.0, "a": 3}, 1)
     one.log_metrics({"loss": 0.5}, 2)
-    assert _rows(path) == [
+    assert rows(path) == [
         {"loss": "1.5", "step": "1", "a": "", "psnr": ""},
         {"loss": "", "step": "1", "a": "3.0", "psnr": "20.0"},
         {"loss": "0.5", "step": "2", "a": "", "psnr": ""},
@@ -35,6 +29,6 @@ def test_a_log_that_was_cut_off_goes_on(start, tmp_path):
     path = tmp_path / "metrics.csv"
     path.write_bytes(start.encode("latin-1"))
     append_row(path, {"step": 3, "loss": 1.0})
-    rows = _rows(path)
-    assert {name: rows[-1][name] for name in ("step", "loss")} == {"step": "3", "loss": "1.0"}
-    assert len(rows) == max(len(start.splitlines()), 1)
+    found = rows(path)
+    assert {name: found[-1][name] for name in ("step", "loss")} == {"step": "3", "loss": "1.0"}
+    assert len(found) == max(len(start.splitlines()), 1)

@@ -1,6 +1,5 @@
 """Training on several devices: the images are shared, the gradients averaged, and there is one splat."""
 
-import csv
 import os
 import socket
 import subprocess
@@ -11,6 +10,7 @@ from pathlib import Path
 import lightning
 import pytest
 import torch
+from shared import rows
 from torch import distributed, multiprocessing
 from torch.utils.data import DataLoader
 
@@ -154,9 +154,8 @@ def test_two_processes_make_one_splat(tmp_path):
         done = _train(tmp_path / f"of{devices}", capture, "--trainer.devices", str(devices))
         assert done.returncode == 0, done.stderr[-2000:]
         assert done.stdout.count("point_cloud.ply\n") == 1  # one process tells it
-        with (tmp_path / f"of{devices}/csv/metrics.csv").open(newline="") as file:
-            rows = [row for row in csv.DictReader(file) if row.get("val/psnr")]
-        psnr.append(float(rows[-1]["val/psnr"]))
+        log = [row for row in rows(tmp_path / f"of{devices}/csv/metrics.csv") if row.get("val/psnr")]
+        psnr.append(float(log[-1]["val/psnr"]))
         (ply,) = (tmp_path / f"of{devices}").rglob("*.ply")
         counts.append(len(read_ply(ply).means))
         stored = torch.load(tmp_path / f"of{devices}/checkpoints/step_{200 // devices:06d}.ckpt", weights_only=True)

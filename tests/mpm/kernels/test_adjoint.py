@@ -26,12 +26,6 @@ from gaussian_swaying.wind.patches import Patches
 WIDE = torch.float64
 
 
-@pytest.fixture(autouse=True)
-def _one_width(monkeypatch):
-    """The number of lanes is a constant of the compiled kernel: the same for all bodies."""
-    monkeypatch.setattr(total, "_lanes", lambda sizes: 4)
-
-
 def _random(seed, *shape):
     return randn(*shape, generator=seeded(seed))
 
