@@ -30,7 +30,6 @@ from .recording.trajectory import load_trajectory as load_trajectory
 from .rendering.cameras.camera_path import LookAtCamera as LookAtCamera
 from .rendering.cameras.camera_path import OrbitCamera as OrbitCamera
 from .rendering.shading import DiffuseShader as DiffuseShader
-from .rendering.shading import PhongShader as PhongShader
 from .simulation.body import Material as Material
 from .simulation.body import Scene as Scene
 from .simulation.draw import Frame as Frame

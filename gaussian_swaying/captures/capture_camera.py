@@ -16,7 +16,7 @@ from gaussian_swaying.captures.photos import clean_name
 from gaussian_swaying.captures.transforms import transforms_files
 from gaussian_swaying.geometry.origin import NO_ORIGIN, Origin
 from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_quat
-from gaussian_swaying.rendering.cameras.camera import Camera, counted_pose, resized_intrinsics
+from gaussian_swaying.rendering.cameras.camera import NEAR, Camera, counted_pose, resized_intrinsics
 from gaussian_swaying.rendering.cameras.camera_path import CameraPath, check_picture
 from gaussian_swaying.rendering.cameras.keyframes import Interpolation, interpolate_keys
 from gaussian_swaying.rendering.cameras.transforms_json import camera_of_transforms, load_transforms
@@ -77,10 +77,9 @@ class CaptureCamera(CameraPath):
         view: Name of the view, with or without folder and extension, or its number from 0 when sorted by name; null to
             move through all views.
         seconds_per_view: Time from one view to the next [s]; the path ends at the last.
-        interpolation: Between views: ``smooth`` or ``linear``, as for KeyframedCamera.
+        interpolation: Between views: ``smooth`` or ``linear``, as for LookAtCamera.
         width: Image width [pixels]; by default that of the capture.
         height: Image height [pixels]; by default that of the capture.
-        near: Near plane [scene units]; a hundredth of the distance or of the object's size when None.
 
     Raises:
         TypeError: If an argument has the wrong type.
@@ -97,7 +96,11 @@ class CaptureCamera(CameraPath):
     interpolation: Interpolation = "smooth"
     width: int | None = None
     height: int | None = None
-    near: float | None = None
+
+    @property
+    def still(self) -> bool:  # type: ignore[override]
+        """True for one view."""
+        return self.view is not None
 
     def __post_init__(self) -> None:
         check_positive("seconds_per_view", self.seconds_per_view)
@@ -108,7 +111,7 @@ class CaptureCamera(CameraPath):
     def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
         """Camera of a frame, see :meth:`CameraPath.__call__`."""
         if not self._cameras:
-            self._read(self.near_of(size))
+            self._read(NEAR * size)
         if len(self._cameras) == 1:
             return self._cameras[0].to(center.device, center.dtype)
         times = [k * self.seconds_per_view for k in range(len(self._cameras))]

@@ -27,7 +27,6 @@ from gaussian_swaying.captures.capture_camera import CaptureCamera
 from gaussian_swaying.config.gone import refuse_gone
 from gaussian_swaying.config.material_names import NAMES, with_material_option, with_named_materials
 from gaussian_swaying.mpm.protocol import Solver
-from gaussian_swaying.rendering.cameras.keyframes import KeyframedCamera
 from gaussian_swaying.wind.field import SpatialWind
 from gaussian_swaying.wind.tables import FrozenWind, Shelter
 from gaussian_swaying.wind.turbulence import Turbulence
@@ -36,7 +35,7 @@ if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
 # imported so that a configuration can use their class names without the module
-CAMERA_PATHS = (CaptureCamera, KeyframedCamera)
+CAMERA_PATHS = (CaptureCamera,)
 EFFECTS = (FrozenWind, Shelter, Turbulence)
 # options that a configuration file cannot contain; settings that may change when a run is resumed
 COMMAND_LINE_ONLY = ("preset",)

@@ -21,7 +21,7 @@ from gaussian_swaying._fixed import changed
 from gaussian_swaying._inputs import read_json
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.rotations import rotation_from_z
-from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
+from gaussian_swaying.rendering.cameras.camera import NEAR, Camera, look_at_camera
 from gaussian_swaying.rendering.cameras.camera_path import PinholePath
 from gaussian_swaying.simulation.model import CENTER, rotation_matrix
 
@@ -465,7 +465,6 @@ class PhysGaussianCamera(PinholePath):
         width: Image width [pixels].
         height: Image height [pixels].
         fov_y: Vertical field of view [degrees].
-        near: Near plane [scene units]; a hundredth of the distance or of the object's size when None.
 
     Raises:
         ValueError: If a number is out of range; at the first frame, if the file is bad.
@@ -521,11 +520,11 @@ class PhysGaussianCamera(PinholePath):
     def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
         """Camera of a frame, see :meth:`CameraPath.__call__`."""
         if self._model is None and self.cameras is not None:
-            self._model = read_model_camera(self.cameras, max(self.index, 0), self.near_of(size))
+            self._model = read_model_camera(self.cameras, max(self.index, 0), NEAR * size)
         if self._model is not None and self.index >= 0:
             return self._model.to(center.device, center.dtype)
         width, height = (self.width, self.height) if self._model is None else (self._model.width, self._model.height)
-        camera = look_at_camera(*self.eye(frame), self.fov_y, width, height, self.near, dtype=torch.float64)
+        camera = look_at_camera(*self.eye(frame), self.fov_y, width, height, dtype=torch.float64)
         if self._model is not None:
             camera = replace(camera, intrinsics=self._model.intrinsics)
         return camera.to(center.device, center.dtype)

@@ -18,12 +18,6 @@ REST_FLOOR = 0.1
 """Relative shading clamps the factors of the moving and the rest normal to at least this before it divides them."""
 
 
-def _lambert(normal: Tensor, light: Tensor, two_sided: bool) -> Tensor:
-    """Return max(0, n.L), or abs(n.L) for two-sided surfaces, shape (..., 1)."""
-    cosine = (normal * light).sum(-1, keepdim=True)
-    return cosine.abs() if two_sided else cosine.clamp_min(0.0)
-
-
 def _relative(factor: Tensor, rest_factor: Tensor) -> Tensor:
     """Return the ratio of two factors, both clamped to at least ``REST_FLOOR``: exactly 1 where they are equal."""
     return factor.clamp_min(REST_FLOOR) / rest_factor.clamp_min(REST_FLOOR)
@@ -36,23 +30,35 @@ def diffuse_shading(
     two_sided: bool = False,
     ambient: float = 0.0,
     rest_normal: Tensor | None = None,
+    view_direction: Tensor | None = None,
+    diffuse: float | None = None,
+    specular: float = 0.0,
+    shininess: float = 32.0,
 ) -> Tensor:
-    r"""Scale colours by the cosine between normal and light.
+    r"""Scale colours by the cosine between normal and light, and add the highlight of the Phong model.
 
     .. math::
-        L_o = s\,c, \qquad s = a + (1 - a) \max(0, \mathbf{n} \cdot \mathbf{L})
+        L_o = s\,c + k_s \max(0, \mathbf{r} \cdot \mathbf{v})^\alpha, \qquad
+        s = a + k_d \max(0, \mathbf{n} \cdot \mathbf{L}),
+        \qquad \mathbf{r} = 2 (\mathbf{n} \cdot \mathbf{L})\, \mathbf{n} - \mathbf{L}
 
-    (arXiv 2512.01306, "Lightweight Shading", with a = 0 there). Captured colours already contain the light of the
-    capture. With ``rest_normal`` the factor is therefore :math:`\max(s, 0.1) / \max(s_\text{rest}, 0.1)`, so the rest
-    shape looks as captured, and there is no division by zero where it faces away from the light.
+    (arXiv 2512.01306, "Lightweight Shading", whose diffuse form has a = 0 and no highlight). The highlight is white and
+    is the same for **n** and **-n**. Captured colours already contain the light of the capture. With ``rest_normal``
+    the factor is therefore :math:`\max(s, 0.1) / \max(s_\text{rest}, 0.1)`, and the highlight of the rest normal is
+    subtracted, so the rest shape looks as captured, and there is no division by zero where it faces away from the
+    light.
 
     Args:
         color: Colours, shape (..., 3).
         normal: Unit normals, shape (..., 3).
         light: Unit vector towards the light, in the frame of the normals, shape (3,).
-        two_sided: Use :math:`|\mathbf{n} \cdot \mathbf{L}|`, for normals without a known outside.
-        ambient: Share a of ambient light, in [0, 1].
+        two_sided: Use :math:`|\mathbf{n} \cdot \mathbf{L}|` in s, for normals without a known outside.
+        ambient: Coefficient a of ambient light.
         rest_normal: Unit normals of the rest shape, shape (..., 3), for shading relative to it.
+        view_direction: Unit vectors from the surface to the eye, in the same frame, shape (..., 3); for a highlight.
+        diffuse: Coefficient k_d; 1 - a if None.
+        specular: Coefficient k_s of the highlight.
+        shininess: Exponent :math:`\alpha` of the highlight.
 
     Returns:
         Shaded colours, not negative, shape (..., 3).
@@ -65,69 +71,29 @@ def diffuse_shading(
     check_shape("color", color, 3)
     check_shape("normal", normal, 3)
     check_shape("light", light, 3)
-    factor = ambient + (1.0 - ambient) * _lambert(normal, light, two_sided)
     if rest_normal is not None:
         check_shape("rest_normal", rest_normal, 3)
-        factor = _relative(factor, ambient + (1.0 - ambient) * _lambert(rest_normal, light, two_sided))
-    return (color * factor).clamp_min(0.0)
+    share = 1.0 - ambient if diffuse is None else diffuse
 
+    def factor(normal: Tensor) -> Tensor:
+        cosine = (normal * light).sum(-1, keepdim=True)
+        return ambient + share * (cosine.abs() if two_sided else cosine.clamp_min(0.0))
 
-def phong_shading(
-    color: Tensor,
-    normal: Tensor,
-    light: Tensor,
-    view_direction: Tensor,
-    k_a: float = 0.3,
-    k_d: float = 0.7,
-    k_s: float = 0.2,
-    shininess: float = 32.0,
-    two_sided: bool = False,
-    rest_normal: Tensor | None = None,
-) -> Tensor:
-    r"""Shade colours with the Phong model.
-
-    .. math::
-        L_o = k_a c + k_d \max(0, \mathbf{n} \cdot \mathbf{L})\, c + k_s \max(0, \mathbf{r} \cdot \mathbf{v})^\alpha,
-        \qquad \mathbf{r} = 2 (\mathbf{n} \cdot \mathbf{L})\, \mathbf{n} - \mathbf{L}
-
-    (arXiv 2512.01306, "Lightweight Shading"). The highlight is white and is the same for **n** and **-n**. With
-    ``rest_normal`` the factor of the colour is divided by that of the rest normal, both clamped to at least 0.1, and
-    the highlight of the rest normal is subtracted, so the rest shape looks as captured.
-
-    Args:
-        color: Colours, shape (..., 3).
-        normal: Unit normals, shape (..., 3).
-        light: Unit vector towards the light, in the frame of the normals, shape (3,).
-        view_direction: Unit vectors from the surface to the eye, in the same frame, shape (..., 3).
-        k_a: Ambient coefficient.
-        k_d: Diffuse coefficient.
-        k_s: Specular coefficient.
-        shininess: Exponent :math:`\alpha` of the highlight.
-        two_sided: Use :math:`|\mathbf{n} \cdot \mathbf{L}|` in the diffuse term.
-        rest_normal: Unit normals of the rest shape, shape (..., 3), for shading relative to it.
-
-    Returns:
-        Shaded colours, not negative, shape (..., 3).
-    """
-    check_shape("color", color, 3)
-    check_shape("normal", normal, 3)
-    check_shape("light", light, 3)
+    scale = factor(normal) if rest_normal is None else _relative(factor(normal), factor(rest_normal))
+    if specular == 0:
+        return (color * scale).clamp_min(0.0)
+    if view_direction is None:
+        raise ValueError("Expected `view_direction` to be given, because the highlight depends on it.")
     check_shape("view_direction", view_direction, 3)
     against = (view_direction * light).sum(-1, keepdim=True)
 
-    def terms(normal: Tensor) -> tuple[Tensor, Tensor]:
-        """Factor of the colour, and max(0, r.v)^shininess with r.v = 2 (n.L) (n.v) - L.v; shapes (..., 1)."""
-        cosine = (normal * light).sum(-1, keepdim=True)
+    def highlight(normal: Tensor) -> Tensor:
+        """max(0, r.v)^shininess with r.v = 2 (n.L) (n.v) - L.v."""
         facing = (normal * view_direction).sum(-1, keepdim=True)
-        factor = k_a + k_d * (cosine.abs() if two_sided else cosine.clamp_min(0.0))
-        return factor, (2.0 * cosine * facing - against).clamp_min(0.0) ** shininess
+        return (2.0 * (normal * light).sum(-1, keepdim=True) * facing - against).clamp_min(0.0) ** shininess
 
-    factor, highlight = terms(normal)
-    if rest_normal is not None:
-        check_shape("rest_normal", rest_normal, 3)
-        rest_factor, rest_highlight = terms(rest_normal)
-        factor, highlight = _relative(factor, rest_factor), highlight - rest_highlight
-    return torch.add(color * factor, highlight, alpha=k_s).clamp_min(0.0)
+    more = highlight(normal) if rest_normal is None else highlight(normal) - highlight(rest_normal)
+    return torch.add(color * scale, more, alpha=specular).clamp_min(0.0)
 
 
 def _unit_light(light: Sequence[float]) -> Tensor:
@@ -136,13 +102,6 @@ def _unit_light(light: Sequence[float]) -> Tensor:
     if float(direction.norm()) < 1e-12:
         raise ValueError("Expected `light` to be a direction, but got the zero vector.")
     return direction / direction.norm()
-
-
-def _check_rest(relative: bool, rest_normal: Tensor | None) -> Tensor | None:
-    """Return the rest normal to use: none unless the shading is relative."""
-    if relative and rest_normal is None:
-        raise ValueError("Expected `rest_normal` to be given, because the shading is relative to the rest shape.")
-    return rest_normal if relative else None
 
 
 class Shader(Component, nn.Module, ABC):
@@ -174,58 +133,15 @@ class Shader(Component, nn.Module, ABC):
 
 
 class DiffuseShader(Shader):
-    """Diffuse shading, see :func:`diffuse_shading`.
+    """Diffuse shading, with a highlight if it is ``specular``: see :func:`diffuse_shading`.
 
     Args:
         light: Direction towards the light in the metric frame (z up), of any length.
         two_sided: Shade both sides of the surface in the same way.
         ambient: Share of ambient light, in [0, 1].
-        relative: Shade relative to the rest shape, which then looks as captured.
-
-    Raises:
-        TypeError: If ``light`` is not a list of numbers.
-        ValueError: If ``light`` is zero or ``ambient`` is out of range.
-    """
-
-    recordable = True
-    light: Tensor
-
-    def __init__(
-        self,
-        light: Sequence[float] = (0.0, 0.0, 1.0),
-        two_sided: bool = False,
-        *,
-        ambient: float = 0.0,
-        relative: bool = False,
-    ) -> None:
-        super().__init__()
-        if not 0.0 <= ambient <= 1.0:
-            raise ValueError(f"Expected `ambient` to be between 0 and 1, but got {ambient}.")
-        self.register_buffer("light", _unit_light(light), persistent=False)
-        self.two_sided, self.ambient, self.relative = bool(two_sided), float(ambient), bool(relative)
-
-    def forward(
-        self,
-        color: Tensor,
-        normal: Tensor,
-        rest_normal: Tensor | None = None,
-        view_direction: Tensor | None = None,
-    ) -> Tensor:
-        """See :class:`Shader`."""
-        rest = _check_rest(self.relative, rest_normal)
-        return diffuse_shading(color, normal, self.light.to(normal), self.two_sided, self.ambient, rest)
-
-
-class PhongShader(Shader):
-    """Phong shading, see :func:`phong_shading`.
-
-    Args:
-        light: Direction towards the light in the metric frame (z up), of any length.
-        k_a: Ambient coefficient, not negative.
-        k_d: Diffuse coefficient, not negative.
-        k_s: Specular coefficient, not negative.
+        diffuse: Coefficient of the diffuse term, not negative; what ``ambient`` leaves of 1 if null.
+        specular: Coefficient of the highlight of the Phong model, not negative.
         shininess: Exponent of the highlight, positive.
-        two_sided: Shade both sides of the surface in the same way.
         relative: Shade relative to the rest shape, which then looks as captured.
 
     Raises:
@@ -239,21 +155,28 @@ class PhongShader(Shader):
     def __init__(
         self,
         light: Sequence[float] = (0.0, 0.0, 1.0),
-        k_a: float = 0.3,
-        *,
-        k_d: float = 0.7,
-        k_s: float = 0.2,
-        shininess: float = 32.0,
         two_sided: bool = False,
+        *,
+        ambient: float = 0.0,
+        diffuse: float | None = None,
+        specular: float = 0.0,
+        shininess: float = 32.0,
         relative: bool = False,
     ) -> None:
         super().__init__()
-        for name, value in (("k_a", k_a), ("k_d", k_d), ("k_s", k_s)):
+        if not 0.0 <= ambient <= 1.0:
+            raise ValueError(f"Expected `ambient` to be between 0 and 1, but got {ambient}.")
+        for name, value in (("diffuse", diffuse or 0.0), ("specular", specular)):
             check_positive(name, value, allow_zero=True)
         check_positive("shininess", shininess)
         self.register_buffer("light", _unit_light(light), persistent=False)
-        self.k_a, self.k_d, self.k_s, self.shininess = float(k_a), float(k_d), float(k_s), float(shininess)
-        self.two_sided, self.relative = bool(two_sided), bool(relative)
+        self.two_sided, self.ambient, self.relative = bool(two_sided), float(ambient), bool(relative)
+        self.diffuse, self.specular, self.shininess = diffuse, float(specular), float(shininess)
+
+    @property
+    def glossy(self) -> bool:
+        """True if the colours depend on the place of the eye, or on a diffuse coefficient of their own."""
+        return self.specular > 0 or self.diffuse is not None
 
     def forward(
         self,
@@ -263,17 +186,8 @@ class PhongShader(Shader):
         view_direction: Tensor | None = None,
     ) -> Tensor:
         """See :class:`Shader`."""
-        if view_direction is None:
-            raise ValueError("Expected `view_direction` to be given, because the highlight depends on it.")
-        return phong_shading(
-            color,
-            normal,
-            self.light.to(normal),
-            view_direction,
-            self.k_a,
-            self.k_d,
-            self.k_s,
-            self.shininess,
-            self.two_sided,
-            _check_rest(self.relative, rest_normal),
-        )
+        if self.relative and rest_normal is None:
+            raise ValueError("Expected `rest_normal` to be given, because the shading is relative to the rest shape.")
+        rest, light = rest_normal if self.relative else None, self.light.to(normal)
+        more = view_direction, self.diffuse, self.specular, self.shininess
+        return diffuse_shading(color, normal, light, self.two_sided, self.ambient, rest, *more)

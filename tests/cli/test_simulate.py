@@ -72,7 +72,7 @@ def test_cameras_and_renders_from_a_configuration(tmp_path, capsys):
     size = {"width": 16, "height": 8}
     keys = [{"time": 0.0, "azimuth": -70, "elevation": 8, "radius": 2}, {"time": 1.0, "azimuth": -40}]
     side = {"class_path": "OrbitCamera", "init_args": size | {"azimuth": 0.0}}
-    cameras = {"side": side, "flight": {"class_path": "KeyframedCamera", "init_args": size | {"keys": keys}}}
+    cameras = {"side": side, "flight": {"class_path": "LookAtCamera", "init_args": size | {"keys": keys}}}
     more = {"cameras": cameras, "recorder": {"renders": ["color", "normal"]}}
     (tmp_path / "more.yaml").write_text(yaml.safe_dump(more))
     out = tmp_path / "run"

@@ -30,7 +30,6 @@ from gaussian_swaying import (
     MaterialPoints,
     MPMSolver,
     OrbitCamera,
-    PhongShader,
     PinnedPoints,
     PinnedRegion,
     Recorder,
@@ -62,10 +61,7 @@ POINTS = {"position": torch.eye(3), "volume": 1.0, "density": 1.0, "youngs_modul
 PATCH = {"aero": AeroForce(), "wind": WindField(), "normal": torch.eye(3)[2:], "area": torch.ones(1)}
 GIVEN = [
     *((kind, {}) for kind in (Material, Copy, Recorder, Contact, WindField, SineSway, UniformGust, GaussianGust)),
-    *(
-        (kind, {})
-        for kind in (AeroForce, MPMSolver, OrbitCamera, DiffuseShader, PhongShader, FlagScene, Sand, Turbulence)
-    ),
+    *((kind, {}) for kind in (AeroForce, MPMSolver, OrbitCamera, DiffuseShader, FlagScene, Sand, Turbulence)),
     *((kind, {"region": BOX}) for kind in (PinnedRegion, MaterialRegion)),
     (Box, {"min": ZERO, "max": UNIT}),
     (Sphere, {"center": ZERO, "radius": 1.0}),

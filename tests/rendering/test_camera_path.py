@@ -10,7 +10,7 @@ from shared import double, value_error
 from gaussian_swaying.captures.capture_camera import CaptureCamera
 from gaussian_swaying.rendering.cameras.camera import orbit_camera
 from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera
-from gaussian_swaying.rendering.cameras.keyframes import CameraKey, KeyframedCamera
+from gaussian_swaying.rendering.cameras.keyframes import CameraKey
 
 
 def test_orbit_path_scales_with_the_object_and_turns_with_time():
@@ -57,7 +57,6 @@ def test_look_at_path_takes_the_up_direction_of_the_scene_by_default(project):
         ({"azimuth": math.nan}, ValueError, "azimuth"),
         ({"radius": 0.0}, ValueError, "radius"),
         ({"target_offset": (0, 0)}, ValueError, "target_offset"),
-        ({"near": -1.0}, ValueError, "near"),
     ],
 )
 def test_bad_orbit_arguments(arguments, error, field):
@@ -74,20 +73,21 @@ def test_bad_look_at_and_capture_arguments():
         LookAtCamera((0, 0, 1), (0, 0, 0), up=(0, 0, 0))
     with pytest.raises(TypeError, match="`width`"):
         CaptureCamera("transforms.json", width=0.5)
+    with value_error("`eye` or `keys`"):
+        LookAtCamera()
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
 def test_the_near_plane_has_the_size_of_the_scene(unit, tmp_path):
-    """A hundredth of the distance to the target, or of the object where a pose has no target; or as given."""
+    """A hundredth of the distance to the target, or of the object where a pose has no target."""
     centre, up = torch.full((3,), 2.0 * unit), torch.tensor([0.0, 0.0, 1.0])
     data = {"w": 8, "h": 8, "camera_angle_x": 1.0, "frames": [{"transform_matrix": torch.eye(4).tolist()}]}
     file = tmp_path / "transforms.json"
     file.write_text(json.dumps(data))
-    for make, expected in (
-        (lambda **near: OrbitCamera(radius=2.0, **near), 0.02),
-        (lambda **near: LookAtCamera((0.0, 0.0, 0.0), (0.0, 3.0 * unit, 0.0), **near), 0.03),
-        (lambda **near: KeyframedCamera([CameraKey(0.0, eye=[2 * unit, unit, 2 * unit])], **near), 0.01),
-        (lambda **near: CaptureCamera(file, 0, **near), 0.01),
+    for camera, expected in (
+        (OrbitCamera(radius=2.0), 0.02),
+        (LookAtCamera((0.0, 0.0, 0.0), (0.0, 3.0 * unit, 0.0)), 0.03),
+        (LookAtCamera(keys=[CameraKey(0.0, eye=[2 * unit, unit, 2 * unit])]), 0.01),
+        (CaptureCamera(file, 0), 0.01),
     ):
-        assert make()(0, 0.0, centre, up, unit).near == pytest.approx(expected * unit)
-        assert make(near=0.4)(0, 0.0, centre, up, unit).near == 0.4
+        assert camera(0, 0.0, centre, up, unit).near == pytest.approx(expected * unit)

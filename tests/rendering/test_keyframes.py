@@ -8,8 +8,8 @@ import torch
 from shared import double, value_error
 
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
-from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
-from gaussian_swaying.rendering.cameras.keyframes import CameraKey, KeyframedCamera, interpolate_keys
+from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera
+from gaussian_swaying.rendering.cameras.keyframes import CameraKey, interpolate_keys
 
 CENTER, UP = torch.zeros(3).double(), double([0.0, 0.0, 1.0])
 TIMES = [0.0, 1.0, 1.5, 4.0]
@@ -58,7 +58,7 @@ def test_angles_are_those_of_the_orbit():
         CameraKey(2.0, azimuth=270.0, fov_y=30.0),
         CameraKey(3.0, target=[1.0, 0.0, 0.0]),
     ]
-    path = KeyframedCamera(keys, width=32, height=18)
+    path = LookAtCamera(keys=keys, width=32, height=18)
     start = OrbitCamera(32, 18, azimuth=-90.0, elevation=10.0, radius=2.0)(0, 0.0, CENTER, UP, 1.5)
     torch.testing.assert_close(path(0, 0.0, CENTER, UP, 1.5).world_to_camera, start.world_to_camera)
     half = OrbitCamera(32, 18, fov_y=35.0, azimuth=90.0, elevation=10.0, radius=2.0)(0, 0.0, CENTER, UP, 1.5)
@@ -72,11 +72,11 @@ def test_angles_are_those_of_the_orbit():
 
 def test_eyes_look_at_their_targets():
     keys = [CameraKey(0.0, eye=[0.0, -3.0, 0.0]), CameraKey(1.0, eye=[2.0, -3.0, 1.0], target=[0.0, 0.0, 1.0])]
-    path = KeyframedCamera(keys, interpolation="linear", width=32, height=18)
+    path = LookAtCamera(keys=keys, interpolation="linear", width=32, height=18)
     found = path(0, 0.5, CENTER, UP, 1.0)
     expected = look_at_camera([1.0, -3.0, 0.5], [0.0, 0.0, 0.5], UP, 40.0, 32, 18, dtype=torch.float64)
     torch.testing.assert_close(found.world_to_camera, expected.world_to_camera)
-    lying = KeyframedCamera(keys, up=[1.0, 0.0, 0.0], width=32, height=18)(0, 0.0, CENTER, UP, 1.0)
+    lying = LookAtCamera(keys=keys, up=[1.0, 0.0, 0.0], width=32, height=18)(0, 0.0, CENTER, UP, 1.0)
     torch.testing.assert_close(lying.world_to_camera[1, :3], double([-1.0, 0.0, 0.0]))
 
 
@@ -95,4 +95,4 @@ def test_eyes_look_at_their_targets():
 )
 def test_bad_keys(keys, words):
     with value_error(words):
-        KeyframedCamera(keys)
+        LookAtCamera(keys=keys)

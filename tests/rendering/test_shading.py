@@ -1,13 +1,14 @@
 """Shading against closed-form values."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
 from shared import double, near, peak, rand, randn, value_error
 from torch.nn.functional import normalize
 
-from gaussian_swaying.rendering.shading import DiffuseShader, PhongShader, diffuse_shading, phong_shading
+from gaussian_swaying.rendering.shading import DiffuseShader, diffuse_shading
 
 COLOR = (0.2, 0.4, 0.8)
 
@@ -67,14 +68,14 @@ def test_relative_leaves_the_rest_picture_unchanged(two_sided):
     normal, color, view = _random_normals(), rand(50, 3), _random_normals()
     for shader in (
         DiffuseShader((1.0, -2.0, 0.5), two_sided=two_sided, relative=True),
-        PhongShader((1.0, -2.0, 0.5), k_a=0.0, two_sided=two_sided, relative=True),
+        DiffuseShader((1.0, -2.0, 0.5), diffuse=0.7, specular=0.2, two_sided=two_sided, relative=True),
     ):
         near(shader(color, normal, normal, view), color, 1e-15)
         assert peak(shader(color, _random_normals(), normal, view) - color) > 0.1
 
 
 @pytest.mark.parametrize(
-    "shader", [DiffuseShader((0, 1, 1), True, ambient=0.2), PhongShader((0, 1, 1), two_sided=True)]
+    "shader", [DiffuseShader((0, 1, 1), True, ambient=0.2), DiffuseShader((0, 1, 1), True, specular=0.2)]
 )
 def test_two_sided_does_not_see_the_sign_of_the_normal(shader):
     normal, color, view = _random_normals(), rand(50, 3), _random_normals()
@@ -86,16 +87,16 @@ def test_phong_closed_form(dtype):
     color, normal, light = _case(dtype)
     eye = math.radians(50.0)
     view = torch.tensor([math.sin(eye), 0.0, math.cos(eye)], dtype=dtype)
-    shaded = phong_shading(color, normal, light, view, 0.1, 0.5, 0.3, 8.0)
+    shaded = diffuse_shading(color, normal, light, False, 0.1, None, view, 0.5, 0.3, 8.0)
     expected = color * (0.1 + 0.5 * math.cos(math.radians(30.0))) + 0.3 * math.cos(math.radians(10.0)) ** 8
     torch.testing.assert_close(shaded, expected)
-    away = phong_shading(color, normal, light, -view, 0.1, 0.5, 0.3, 8.0)
+    away = diffuse_shading(color, normal, light, False, 0.1, None, -view, 0.5, 0.3, 8.0)
     torch.testing.assert_close(away, color * (0.1 + 0.5 * math.cos(math.radians(30.0))))
 
 
 def test_phong_relative_subtracts_the_rest_highlight():
     color, normal, light = _case(torch.float64)
-    shader = PhongShader((0, 0, 3), 0.2, k_d=0.6, k_s=0.5, shininess=4.0, relative=True)
+    shader = DiffuseShader((0, 0, 3), ambient=0.2, diffuse=0.6, specular=0.5, shininess=4.0, relative=True)
     shaded = shader(color, normal, light, light)  # at rest: normal, light and eye coincide, highlight 1
     cosine = math.cos(math.radians(30.0))
     expected = color * (0.2 + 0.6 * cosine) / 0.8 + 0.5 * (math.cos(math.radians(60.0)) ** 4 - 1.0)
@@ -111,12 +112,12 @@ def test_gradients():
     rest = _random_normals(5)
     for shader in (
         DiffuseShader((1, 1, 1), True, ambient=0.3, relative=True),
-        PhongShader((1, 1, 1), shininess=3.0, relative=True),
+        DiffuseShader((1, 1, 1), specular=0.2, shininess=3.0, relative=True),
     ):
         assert torch.autograd.gradcheck(lambda c, n, shader=shader: shader(c, n, rest, view), (color, normal))
 
 
-@pytest.mark.parametrize("shader", [DiffuseShader, PhongShader])
+@pytest.mark.parametrize("shader", [DiffuseShader, partial(DiffuseShader, specular=0.2)])
 def test_bad_arguments(shader):
     with value_error("`light`"):
         shader(light=(0.0, 0.0, 0.0))

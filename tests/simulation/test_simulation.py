@@ -17,7 +17,7 @@ from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.rendering.cameras.camera import orbit_camera
 from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera
 from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer, make_renderer
-from gaussian_swaying.rendering.shading import DiffuseShader, PhongShader
+from gaussian_swaying.rendering.shading import DiffuseShader
 from gaussian_swaying.rendering.torch_renderer import render_torch
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.body import Material, Scene
@@ -374,8 +374,11 @@ def test_the_first_picture_is_that_of_the_splat(flag_ply, make_simulation):
 PICTURES = {
     "plain": (None, {}),
     "diffuse": (DiffuseShader([1.0, 0.5, 1.0], relative=True), {}),
-    "phong": (PhongShader([1.0, 0.5, 1.0], two_sided=True, relative=True), {"up": [0.0, -1.0, 0.0]}),
-    "part": (PhongShader(), {"region": up_to(x=0.6), "up": [0.3, 1.0, 0.0]}),
+    "phong": (
+        DiffuseShader([1.0, 0.5, 1.0], two_sided=True, ambient=0.3, specular=0.2, relative=True),
+        {"up": [0.0, -1.0, 0.0]},
+    ),
+    "part": (DiffuseShader(ambient=0.3, specular=0.2), {"region": up_to(x=0.6), "up": [0.3, 1.0, 0.0]}),
 }
 
 

@@ -91,10 +91,10 @@ def test_the_camera_finds_the_gaussians_in_any_scene(parser, settings, tmp_path)
 
 def test_what_a_browser_cannot_draw_is_drawn_here(parser, settings, session):
     assert drawable(session.snapshot)
-    light = {"light": [0.0, -1.0, 0.0]}
     session.settings.shader = None
-    for shader, good in (("PhongShader", False), ("DiffuseShader", True)):
-        session._change({"shader": {"class_path": shader, "init_args": light}})
+    for specular, good in ((0.2, False), (0.0, True)):
+        light = {"light": [0.0, -1.0, 0.0], "specular": specular}
+        session._change({"shader": {"class_path": "DiffuseShader", "init_args": light}})
         assert drawable(session.snapshot) is good
     session._change({"shader": None})
     assert drawable(session.snapshot)

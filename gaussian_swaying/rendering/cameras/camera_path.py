@@ -14,7 +14,6 @@ from gaussian_swaying._fixed import Fixed
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.origin import NO_ORIGIN, Origin
 from gaussian_swaying.rendering.cameras.camera import (
-    NEAR,
     Camera,
     check_direction,
     check_elevation,
@@ -23,6 +22,7 @@ from gaussian_swaying.rendering.cameras.camera import (
     look_at_camera,
     orbit_camera,
 )
+from gaussian_swaying.rendering.cameras.keyframes import CameraKey, Interpolation, KeyedCamera
 
 
 class CameraPath(Fixed, ABC):
@@ -36,7 +36,6 @@ class CameraPath(Fixed, ABC):
     captured: bool = False
     still: bool = False
 
-    near: float | None = None
     _origin: Origin = NO_ORIGIN
 
     def counted_from(self, origin: Origin) -> CameraPath:
@@ -50,10 +49,6 @@ class CameraPath(Fixed, ABC):
     def in_space(self, frame: SimFrame) -> CameraPath:
         """The path of a simulation in another space than the scene's, from which a frame leads to scene units."""
         return self
-
-    def near_of(self, size: float) -> float:
-        """Near plane for an object of a size [scene units]."""
-        return NEAR * size if self.near is None else self.near
 
     @abstractmethod
     def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
@@ -72,15 +67,13 @@ class CameraPath(Fixed, ABC):
 
 
 def check_picture(camera: CameraPath) -> None:
-    """Raise TypeError or ValueError unless size, field of view and near plane of a path's pictures are valid."""
+    """Raise TypeError or ValueError unless size and field of view of a path's pictures are valid."""
     given = vars(camera)
     for name in ("width", "height"):
         if given[name] is not None:  # that of the capture
             check_pixels(name, given[name])
     if "fov_y" in given:
         check_fov("fov_y", given["fov_y"])
-    if given["near"] is not None:
-        check_positive("near", given["near"])
 
 
 @dataclass(eq=False, kw_only=True)
@@ -91,20 +84,18 @@ class PinholePath(CameraPath):
         width: Image width [pixels].
         height: Image height [pixels].
         fov_y: Vertical field of view [degrees].
-        near: Near plane [scene units]; a hundredth of the distance or of the object's size when None.
     """
 
     width: int = 960
     height: int = 540
     fov_y: float = 40.0
-    near: float | None = None
 
     def __post_init__(self) -> None:
         check_picture(self)
 
     def picture(self, like: Tensor, fov_y: float | None = None) -> dict[str, Any]:
         """Lens, size, device and type (those of a tensor) for :func:`look_at_camera` and :func:`orbit_camera`."""
-        lens = {"fov_y_degrees": fov_y or self.fov_y, "width": self.width, "height": self.height, "near": self.near}
+        lens = {"fov_y_degrees": fov_y or self.fov_y, "width": self.width, "height": self.height}
         return {**lens, "device": like.device, "dtype": like.dtype}
 
 
@@ -124,7 +115,6 @@ class OrbitCamera(PinholePath):
         degrees_per_second: Speed of the azimuth [degrees/s].
         target_offset: Vector from the object's centre to the target, along the scene's axes, in multiples of the
             object's longest side.
-        near: Near plane [scene units]; a hundredth of the distance or of the object's size when None.
 
     Raises:
         TypeError: If an argument has the wrong type.
@@ -163,35 +153,61 @@ class OrbitCamera(PinholePath):
 
 @dataclass(eq=False)
 class LookAtCamera(PinholePath):
-    """Fixed camera at a given point.
+    """Camera at a given point, or on a path through keys: from eye to eye, or on a sphere about its target.
 
     Args:
         eye: Position [scene units], 3 numbers.
-        target: Point at the image centre [scene units], 3 numbers.
-        up: Direction seen upwards in the image, 3 numbers; that of the scene when None.
+        target: Point at the image centre [scene units], 3 numbers; the object's centre when None.
+        keys: Instead, times and positions, sorted by time.
+        interpolation: ``smooth`` (continuous speed, at rest before the first key and after the last, no overshoot) or
+            ``linear``.
+        up: Direction seen upwards in the image where an ``eye`` is given, 3 numbers; that of the scene when None.
         width: Image width [pixels].
         height: Image height [pixels].
         fov_y: Vertical field of view [degrees].
-        near: Near plane [scene units]; a hundredth of the distance or of the object's size when None.
 
     Raises:
         TypeError: If an argument has the wrong type.
-        ValueError: If a number is out of range, or the line of sight is not defined.
+        ValueError: If a number is out of range, the line of sight is not defined, the times do not increase, or the
+            keys give neither or both of eye and angles.
+
+    Example:
+        >>> keys = [CameraKey(0.0, azimuth=-90, elevation=10, radius=2), CameraKey(2.0, azimuth=0)]
+        >>> import torch
+        >>> center, up = torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])
+        >>> LookAtCamera(keys=keys)(50, 2.0, center, up, 1.0).position.round(decimals=3)
+        tensor([1.9700, 0.0000, 0.3470])
     """
 
-    still = True
-    eye: Sequence[float]
-    target: Sequence[float]
+    eye: Sequence[float] | None = None
+    target: Sequence[float] | None = None
     _: KW_ONLY
+    keys: list[CameraKey] | None = None
+    interpolation: Interpolation = "smooth"
     up: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.eye, self.target = check_vector("eye", self.eye), check_vector("target", self.target)
-        if self.eye == self.target:
-            raise ValueError(f"Expected `eye` and `target` to differ, but both are {list(self.eye)}.")
+        if (self.eye is None) == (self.keys is None):
+            raise ValueError("Expected `eye` or `keys` of the LookAtCamera, but got neither or both.")
+        self.eye = None if self.eye is None else check_vector("eye", self.eye)
+        self.target = None if self.target is None else check_vector("target", self.target)
         self.up = None if self.up is None else check_direction("up", self.up)
+        eye, target = (None if place is None else list(place) for place in (self.eye, self.target))
+        keys = [CameraKey(0.0, eye, target=target)] if self.keys is None else self.keys
+        self._path = KeyedCamera(keys, self.fov_y, self.interpolation)
+
+    @property
+    def still(self) -> bool:  # type: ignore[override]
+        """True if it does not move."""
+        return len(self._path.times) == 1
 
     def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
         """Camera of a frame, see :meth:`CameraPath.__call__`."""
-        return look_at_camera(self.eye, self.target, up if self.up is None else self.up, **self.picture(center))
+        check_positive("size", size)
+        place, target, fov = self._path.at(time, check_vector("center", center))
+        picture = self.picture(center, fov)
+        if self._path.orbits:
+            azimuth, elevation, radius = place
+            return orbit_camera(target, up, size * radius, azimuth, elevation, **picture)
+        return look_at_camera(place, target, up if self.up is None else self.up, **picture)

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal
 
-from torch import Tensor
-
 from gaussian_swaying._checks import check_positive, check_vector
 from gaussian_swaying._fixed import fixed
-from gaussian_swaying.rendering.cameras.camera import Camera, check_elevation, check_fov, look_at_camera, orbit_camera
-from gaussian_swaying.rendering.cameras.camera_path import PinholePath
+from gaussian_swaying.rendering.cameras.camera import check_elevation, check_fov
 
 Interpolation = Literal["smooth", "linear"]
 
@@ -94,43 +91,22 @@ class CameraKey:
     fov_y: float | None = None
 
 
-@dataclass(eq=False)
-class KeyframedCamera(PinholePath):
-    """Camera that moves through keys: from eye to eye, or on a sphere about its target.
+class KeyedCamera:
+    """Keys, filled up: the place, the target and the field of view at a time.
 
     Args:
         keys: Times and positions, sorted by time.
-        interpolation: ``smooth`` (continuous speed, at rest before the first key and after the last, no overshoot) or
-            ``linear``.
-        up: Direction seen upwards in the image where the keys give an ``eye``, 3 numbers; that of the scene when None.
-        width: Image width [pixels].
-        height: Image height [pixels].
-        fov_y: Vertical field of view [degrees].
-        near: Near plane [scene units]; a hundredth of the distance or of the object's size when None.
+        fov_y: Field of view of keys that give none [degrees].
+        interpolation: As in :func:`interpolate_keys`.
 
-    Raises:
-        TypeError: If an argument has the wrong type.
-        ValueError: If a number is out of range, the times do not increase, or the keys give neither or both of eye and
-            angles.
-
-    Example:
-        >>> path = KeyframedCamera([CameraKey(0.0, azimuth=-90, elevation=10, radius=2), CameraKey(2.0, azimuth=0)])
-        >>> import torch
-        >>> center, up = torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])
-        >>> path(50, 2.0, center, up, 1.0).position.round(decimals=3)
-        tensor([1.9700, 0.0000, 0.3470])
+    Attributes:
+        orbits: Whether places are azimuth, elevation and radius.
     """
 
-    keys: list[CameraKey]
-    interpolation: Interpolation = "smooth"
-    _: KW_ONLY
-    up: Sequence[float] | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        keys = self.keys
+    def __init__(self, keys: Sequence[CameraKey], fov_y: float, interpolation: Interpolation) -> None:
         if not keys:
             raise ValueError("Expected `keys` to hold at least one key with a time and a position.")
+        self.interpolation = interpolation
         self.times = [check_vector("keys.time", [key.time], 1)[0] for key in keys]
         if any(a >= b for a, b in pairwise(self.times)):
             raise ValueError(f"Expected the times of `keys` to increase, but got {self.times}.")
@@ -153,23 +129,19 @@ class KeyframedCamera(PinholePath):
             self.places = [list(check_vector("keys.eye", eye)) for eye in eyes]
         targets = _filled([key.target for key in keys], None)
         self.targets = [None if target is None else check_vector("keys.target", target) for target in targets]
-        self.fovs = [[check_fov("keys.fov_y", value)] for value in _filled([key.fov_y for key in keys], self.fov_y)]
-        self.up = None if self.up is None else check_vector("up", self.up)
+        for place, target in zip(self.places, self.targets, strict=True):
+            if not self.orbits and target is not None and place == list(target):
+                raise ValueError(f"Expected `eye` and `target` to differ, but both are {place}.")
+        self.fovs = [[check_fov("keys.fov_y", value)] for value in _filled([key.fov_y for key in keys], fov_y)]
 
-    def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
-        """Camera of a frame, see :meth:`CameraPath.__call__`."""
-        check_positive("size", size)
-        middle = check_vector("center", center)
+    def at(self, time: float, middle: Sequence[float]) -> tuple[list[float], list[float], float]:
+        """Place, target and field of view [degrees] at a time [s]; ``middle`` is the target of keys without one."""
         targets = [middle if target is None else target for target in self.targets]
         place, target, (fov,) = (
             interpolate_keys(self.times, values, time, self.interpolation)
             for values in (self.places, targets, self.fovs)
         )
-        picture = self.picture(center, fov)
-        if self.orbits:
-            azimuth, elevation, radius = place
-            return orbit_camera(target, up, size * radius, azimuth, elevation, **picture)
-        return look_at_camera(place, target, up if self.up is None else self.up, **picture)
+        return place, target, fov
 
 
 _ANGLES = ("azimuth", "elevation", "radius")
