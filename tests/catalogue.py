@@ -66,14 +66,14 @@ def made(kind, /, *given, **settings):
 
 def conditions(region):
     """Conditions that are no obstacles, in and beside a region."""
-    pull = [0.1, 0.0, 0.0], [0.0, 0.0, 1.0], [0.1, 0.2, 0.3]
-    front = {"first": [0.0, -0.3, 0.1], "last": [0.2, 0.9, 0.3]}
+    pull = {"velocity": [0.1, 0.0, 0.0], "angular_velocity": [0.0, 0.0, 1.0], "pivot": [0.1, 0.2, 0.3]}
+    front = [[0.0, -0.3, 0.1], [0.0, 0.9, 0.1]]
     return {
         "pin": made("PinnedRegion", region),
         "points": made("PinnedPoints", [[0.1, 0.2, 0.3], [0.3, 0.1, 0.2]]),
-        "handle": made("Handle", region, *pull),
-        "release": made("SequentialRelease", region, [0.0, 1.0, 0.0]),
-        "front": made("SequentialRelease", region, [0.0, 1.0, 0.0], **front),
+        "handle": made("PinnedRegion", region, **pull),
+        "release": made("PinnedRegion", region, front=[[0.0, 1.0, 0.0]], end=1.0),
+        "front": made("PinnedRegion", region, front=front, end=1.0),
         "impulse": made("Impulse", region, [0.1, 0.2, 0.3]),
         "impulse for each": made("Impulse", region, [0.01, 0.02, 0.03], per_particle=True),
         "plane": made("Plane", [0.11, 0.12, 0.23], [0.0, 1.0, 1.5], "slip", 0.3),

@@ -351,9 +351,8 @@ def _impulse(take: Fields, space: Turned, notes: Notes) -> list[dict[str, Any]]:
 def _held(region: dict[str, Any], take: Fields, space: Turned, notes: Notes) -> dict[str, Any]:
     velocity, window = space.vector(take.vector("velocity")), _window(take, required=True)
     notes.add(f"`enforce_particle_translation`: {_HOLDS}")
-    if any(velocity):
-        return part("Handle", region=region, velocity=velocity, kind="nodes", **window)
-    return part("PinnedRegion", region=region, kind="nodes", **window)
+    moved = {"velocity": velocity} if any(velocity) else {}
+    return part("PinnedRegion", region=region, kind="nodes", **moved, **window)
 
 
 def _rotation(take: Fields, space: Turned, notes: Notes) -> dict[str, Any]:
@@ -370,7 +369,7 @@ def _rotation(take: Fields, space: Turned, notes: Notes) -> dict[str, Any]:
     if rate == 0 and speed == 0:
         return part("PinnedRegion", region=region, kind="nodes", **window)
     return part(
-        "Handle",
+        "PinnedRegion",
         region=region,
         velocity=space.vector([speed * c for c in normal]),
         angular_velocity=space.vector([-rate * c for c in normal]),  # PhysGaussian turns clockwise about its normal
@@ -428,19 +427,8 @@ def _release(take: Fields, notes: Notes) -> dict[str, Any]:
     )
     low, high = [0.0] * 3, [2.0] * 3
     low[axis], high[axis] = min(first, last), max(first, last)
-    direction = [0.0] * 3
-    direction[axis] = 1.0 if last > first else -1.0
     ends = [[v if k == axis else 1.0 for k in range(3)] for v in (first, last)]
-    return part(
-        "SequentialRelease",
-        region=box(low, high),
-        kind="nodes",
-        direction=direction,
-        start=0.0,
-        end=end,
-        first=ends[0],
-        last=ends[1],
-    )
+    return part("PinnedRegion", region=box(low, high), kind="nodes", front=ends, start=0.0, end=end)
 
 
 @dataclass(eq=False)

@@ -123,11 +123,21 @@ class PinnedRegion(ParticleBoundary):
       fraction of a cell: in ``total`` it lies between 0.4 cells too far out and 0.4 cells too far in, depending on how
       the particles lie on the grid, and is right on average; in ``updated`` it lies about 0.7 cells too far in.
 
+    It may travel and turn as a rigid body: each substep moves what is held exactly to its place in the rigid motion, so
+    a pin that turns for minutes neither grows nor drifts. As a ``hinge`` it turns its points, but not the slope of a
+    sheet; as a ``clamp`` it turns both. With a ``front`` it releases its particles one after the other.
+
     Args:
         region: Region of the pinned particles at rest, in scene units.
         kind: ``hinge`` and ``clamp`` (only in ``total``), ``nodes``, or None. None is ``nodes`` in ``updated``. In
             ``total`` it is ``hinge`` for a sheet (up to 1.25 cells thick where it is held, and at least two cells and
             2.5 thicknesses wide) and for points that are released one by one, and ``clamp`` for anything else.
+        velocity: Velocity [m/s], z up.
+        angular_velocity: Axis of the rotation times its rate [rad/s], z up.
+        pivot: Point about which it turns, in scene units at time ``start``; it travels with ``velocity``.
+        front: Direction of a front that releases what it passes, in scene axes: ``[direction]``. It meets the first
+            particle at ``start``, and passes the last one at ``end``; or two places in scene units instead of these
+            particles, ``[first, last]``, in planes across their line. Before ``start``, all are held.
         start: Time from which it acts [s].
         end: Time from which it no longer acts [s]; None for never.
     """
@@ -140,6 +150,10 @@ class PinnedRegion(ParticleBoundary):
         region: Region,
         kind: str | None = None,
         *,
+        velocity: Sequence[float] = (0.0, 0.0, 0.0),
+        angular_velocity: Sequence[float] = (0.0, 0.0, 0.0),
+        pivot: Sequence[float] = (0.0, 0.0, 0.0),
+        front: list[list[float]] | None = None,
         start: float = 0.0,
         end: float | None = None,
     ) -> None:
@@ -147,6 +161,87 @@ class PinnedRegion(ParticleBoundary):
         if kind is not None:
             check_choice("kind", kind, KINDS)
         self.kind = kind
+        turn = check_vector("angular_velocity", angular_velocity)
+        self.rate = math.sqrt(sum(c * c for c in turn))
+        for name, value in (
+            ("velocity", check_vector("velocity", velocity)),
+            ("axis", [c / self.rate if self.rate > 0 else 0.0 for c in turn]),
+            ("pivot", check_vector("pivot", pivot)),
+        ):
+            self.register_buffer(name, torch.tensor(value, dtype=torch.float64))
+        self.driven = self.rate > 0 or any(velocity)
+        ends = None
+        if front is not None:
+            ends = torch.tensor([check_vector("front", place) for place in front], dtype=torch.float64)
+            if len(front) not in (1, 2) or not bool((ends[-1] - ends[:-1].sum(0)).any()):
+                raise ValueError(f"Expected `front` to be a direction, or two places apart, but got {front}.")
+            if not math.isfinite(self.end):
+                raise ValueError(f"Expected `end` of a PinnedRegion with a `front` to be a finite time, but got {end}.")
+        self.register_buffer("front", ends)
+        self.velocity: Tensor
+        self.axis: Tensor
+        self.pivot: Tensor
+        self.front: Tensor | None
+
+    @property
+    def moves(self) -> bool:
+        """True if it travels or turns."""
+        return self.driven or type(self).target is not PinnedRegion.target
+
+    @property
+    def needs_lattice(self) -> bool:  # type: ignore[override]
+        """True if it moves."""
+        return self.moves
+
+    @property
+    def holds_from(self) -> float:
+        return self.start if self.front is None else -math.inf
+
+    def active(self, time: Tensor) -> Tensor:
+        """With a front always: particles are released one by one instead."""
+        return super().active(time) if self.front is None else time > -math.inf
+
+    def in_frame(self, frame: SimFrame) -> PinnedRegion:
+        """The pin with its places in metres, z up."""
+        tensors = {"pivot": frame.point_to_sim(self.pivot)}
+        if self.front is not None:
+            alone = len(self.front) == 1
+            tensors["front"] = frame.direction_to_sim(self.front) if alone else frame.point_to_sim(self.front)
+        return self.copy_in(frame, **tensors)
+
+    def target(self, place: Tensor, time: Tensor, dt: float | Tensor) -> Tensor:
+        """Velocity of the rigid motion, such that an explicit step ends exactly on it.
+
+        Shape (..., 3) [m/s].
+        """
+        driven = self.velocity.to(place).expand_as(place)
+        if self.rate > 0:
+            pivot = (self.pivot + self.velocity * (time - self.start)).to(place)
+            axis = self.axis.to(place).expand_as(place)
+            across = torch.linalg.cross(axis, place - pivot, dim=-1)
+            # the chord of the arc (Rodrigues), not the tangent: the velocity whose explicit step ends on the circle
+            angle = self.rate * dt
+            inward = (2 * _sin(angle / 2) ** 2 / dt) * torch.linalg.cross(axis, across, dim=-1)
+            driven = driven + (_sin(angle) / dt) * across + inward
+        return driven
+
+    def release_time(self, rest_position: Tensor) -> Tensor | None:
+        """When the front passes each particle [s], shape (..., P), float64."""
+        if self.front is None:
+            return None
+        mask = self.region.contains(rest_position)
+        place = in_double(rest_position)
+        mask = mask.to(place.device)
+        front = self.front.to(place.device)
+        direction = front[0] if len(front) == 1 else front[1] - front[0]
+        along = (place * direction).sum(-1)
+        if len(front) == 1:
+            low = along.where(mask, math.inf).amin(-1, keepdim=True)
+            high = along.where(mask, -math.inf).amax(-1, keepdim=True)
+        else:
+            low, high = (front @ direction).unbind()
+        part = (along - low) / (high - low).clamp(min=torch.finfo(torch.float64).tiny)
+        return self.start + part * (self.end - self.start)
 
     def hold_kind(self, neighbours_fixed: bool) -> str:
         """The ``kind``, or the one that suits the formulation."""
@@ -158,9 +253,9 @@ class PinnedRegion(ParticleBoundary):
 
     def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
         """Give the held nodes their target velocity."""
-        target = (
-            torch.zeros_like(velocity) if nodes.lattice is None else self.target(nodes.lattice, nodes.time, nodes.dt)
-        )
+        target = torch.zeros_like(velocity)
+        if self.moves and nodes.lattice is not None:
+            target = self.target(nodes.lattice, nodes.time, nodes.dt)
         return torch.where((nodes.pinned & self.active(nodes.time))[..., None], target, velocity)
 
 
@@ -216,147 +311,8 @@ class PinnedPoints(Boundary):
         return velocity
 
 
-class Handle(PinnedRegion):
-    """Moves the particles of a region as a rigid body: a pin that travels and turns.
-
-    Each substep moves what is held exactly to its place in the rigid motion, so a handle that turns for minutes neither
-    grows nor drifts. It releases the material when its time window ends. As a ``hinge`` it turns its points, but not
-    the slope of a sheet; as a ``clamp`` it turns both.
-
-    Args:
-        region: Region of the held particles at rest, in scene units.
-        velocity: Velocity [m/s], z up.
-        angular_velocity: Axis of the rotation times its rate [rad/s], z up.
-        pivot: Point about which it turns, in scene units at time ``start``; it travels with ``velocity``.
-        kind: ``hinge``, ``clamp``, ``nodes`` or None, as for a :class:`PinnedRegion`.
-        start: Time from which it acts [s].
-        end: Time from which it no longer acts [s]; None for never.
-    """
-
-    needs_lattice = True
-    recordable = True
-
-    def __init__(
-        self,
-        region: Region,
-        velocity: Sequence[float] = (0.0, 0.0, 0.0),
-        angular_velocity: Sequence[float] = (0.0, 0.0, 0.0),
-        pivot: Sequence[float] = (0.0, 0.0, 0.0),
-        kind: str | None = None,
-        start: float = 0.0,
-        end: float | None = None,
-    ) -> None:
-        super().__init__(region, kind, start=start, end=end)
-        turn = check_vector("angular_velocity", angular_velocity)
-        self.rate = math.sqrt(sum(c * c for c in turn))
-        for name, value in (
-            ("velocity", check_vector("velocity", velocity)),
-            ("axis", [c / self.rate if self.rate > 0 else 0.0 for c in turn]),
-            ("pivot", check_vector("pivot", pivot)),
-        ):
-            self.register_buffer(name, torch.tensor(value, dtype=torch.float64))
-        self.velocity: Tensor
-        self.axis: Tensor
-        self.pivot: Tensor
-
-    def in_frame(self, frame: SimFrame) -> Handle:
-        """The handle with its region and pivot in metres."""
-        return self.copy_in(frame, pivot=frame.point_to_sim(self.pivot))
-
-    def target(self, place: Tensor, time: Tensor, dt: float | Tensor) -> Tensor:
-        """Velocity of the rigid motion, such that an explicit step ends exactly on it.
-
-        Shape (..., 3) [m/s].
-        """
-        driven = self.velocity.to(place).expand_as(place)
-        if self.rate > 0:
-            pivot = (self.pivot + self.velocity * (time - self.start)).to(place)
-            axis = self.axis.to(place).expand_as(place)
-            across = torch.linalg.cross(axis, place - pivot, dim=-1)
-            # the chord of the arc (Rodrigues), not the tangent: the velocity whose explicit step ends on the circle
-            angle = self.rate * dt
-            inward = (2 * _sin(angle / 2) ** 2 / dt) * torch.linalg.cross(axis, across, dim=-1)
-            driven = driven + (_sin(angle) / dt) * across + inward
-        return driven
-
-
 def _sin(angle: float | Tensor) -> float | Tensor:
     return angle.sin() if isinstance(angle, Tensor) else math.sin(angle)
-
-
-class SequentialRelease(PinnedRegion):
-    """Holds the particles of a region and releases them one after the other, as a front passes over them.
-
-    Args:
-        region: Region of the held particles at rest, in scene units.
-        direction: Direction in which the front travels, in scene axes.
-        start: Time at which the front meets the first particle [s]; before that, all are held.
-        end: Time at which it passes the last one [s].
-        kind: ``hinge``, ``clamp``, ``nodes`` or None, as for a :class:`PinnedRegion`. Points are released when the
-            front passes them.
-        first: Point that the front meets at ``start``, in scene units, instead of the first particle.
-        last: Point that it passes at ``end``, in scene units, instead of the last particle; must be given together with
-            ``first`` and lie farther along ``direction``.
-    """
-
-    def __init__(
-        self,
-        region: Region,
-        direction: Sequence[float] = (0.0, 0.0, 1.0),
-        start: float = 0.0,
-        end: float = 1.0,
-        kind: str | None = None,
-        first: Sequence[float] | None = None,
-        last: Sequence[float] | None = None,
-    ) -> None:
-        super().__init__(region, kind, start=start, end=end)
-        if not math.isfinite(self.end):
-            raise ValueError(f"Expected `end` of the SequentialRelease to be a finite time, but got {end}.")
-        if not any(check_vector("direction", direction)):
-            raise ValueError("Expected `direction` of the SequentialRelease not to be zero.")
-        self.register_buffer("direction", torch.tensor([float(c) for c in direction], dtype=torch.float64))
-        self.direction: Tensor
-        if (first is None) != (last is None):
-            raise ValueError("Give both `first` and `last` of the SequentialRelease, or neither.")
-        ends = None
-        if first is not None and last is not None:
-            ends = torch.tensor([check_vector("first", first), check_vector("last", last)], dtype=torch.float64)
-            if not float((ends[1] - ends[0]) @ self.direction) > 0:
-                raise ValueError(
-                    f"Expected `last` of the SequentialRelease to be farther along `direction` than `first`, but got "
-                    f"{list(last)} and {list(first)}."
-                )
-        self.register_buffer("ends", ends)  # first and last, shape (2, 3)
-        self.ends: Tensor | None
-
-    def in_frame(self, frame: SimFrame) -> SequentialRelease:
-        """The release with its region, direction and points in metres, z up."""
-        tensors = {"direction": frame.direction_to_sim(self.direction).clone()}
-        if self.ends is not None:
-            tensors["ends"] = frame.point_to_sim(self.ends)
-        return self.copy_in(frame, **tensors)
-
-    @property
-    def holds_from(self) -> float:
-        return -math.inf
-
-    def active(self, time: Tensor) -> Tensor:
-        """Always: particles are released one by one instead."""
-        return time > -math.inf
-
-    def release_time(self, rest_position: Tensor) -> Tensor:
-        """When the front passes each particle [s], shape (..., P), float64."""
-        mask = self.region.contains(rest_position)
-        place = in_double(rest_position)
-        mask = mask.to(place.device)
-        along = (place * self.direction.to(place.device)).sum(-1)
-        if self.ends is None:
-            low = along.where(mask, math.inf).amin(-1, keepdim=True)
-            high = along.where(mask, -math.inf).amax(-1, keepdim=True)
-        else:
-            low, high = (self.ends.to(along) @ self.direction.to(along)).unbind()
-        part = (along - low) / (high - low).clamp(min=torch.finfo(torch.float64).tiny)
-        return self.start + part * (self.end - self.start)
 
 
 class Impulse(ParticleBoundary):

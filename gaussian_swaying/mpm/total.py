@@ -490,7 +490,7 @@ class TotalRun(Run):
         self.taken_and_done = torch.zeros(self.impulse.numel() + self.scenes, dtype=torch.float64, device=self.device)
         pins = (PinnedRegion, PinnedPoints)
         self.plain = all(
-            kind == "surface" or (type(b) in pins and b.always)
+            kind == "surface" or (type(b) in pins and b.always and not b.moves)
             for b, kind in zip(bound.boundaries, bound.kinds, strict=True)
         )
         """True if the kernels apply all boundaries but obstacles, which are contact."""

@@ -564,7 +564,7 @@ class UpdatedRun(Run):
 
 
 def _pins(boundary: Boundary, held: Pinned) -> bool:
-    return type(boundary) is PinnedRegion and held.release is None
+    return type(boundary) is PinnedRegion and held.release is None and not boundary.moves
 
 
 def crowd_of(position: Tensor, dx: float) -> float:

@@ -200,7 +200,7 @@ CASES = {
             "aero.drag_step": "semi_implicit",
             "solver.boundaries": [
                 named("PinnedRegion", region=box(None, 0.1), kind="clamp"),
-                named("Handle", region=box(1.1, None), velocity=[0.1, 0.3, 0.0]),
+                named("PinnedRegion", region=box(1.1, None), velocity=[0.1, 0.3, 0.0]),
                 named("Impulse", region=box(0.4, 0.6), impulse=[0.0, -0.05, 0.0]),
                 named("Obstacle", shape=WALL, friction=0.4),
             ],

@@ -11,7 +11,7 @@ from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.regions import Cylinder, Everything, Not, Sphere, Union
 from gaussian_swaying.mpm.colliders import EnclosingBox, Plane, VelocityBox
-from gaussian_swaying.mpm.pins import Handle, Impulse, PinnedRegion, SequentialRelease
+from gaussian_swaying.mpm.pins import Impulse, PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
 from gaussian_swaying.recording.trajectory import load_trajectory
@@ -60,8 +60,8 @@ def test_a_step_never_makes_the_host_wait(formulation):
     corner, ball, rod = beyond(z=0.8), Sphere([0, 0, 0], 0.5), Cylinder([1, 1, 1], [1, 2, 0], 1, 1)
     boundaries = [
         PinnedRegion(corner),
-        Handle(corner, [0.1, 0, 0], [0, 0, 1], [0.5, 0.5, 0.5]),
-        SequentialRelease(ball, [1, 0, 0]),
+        PinnedRegion(corner, velocity=[0.1, 0, 0], angular_velocity=[0, 0, 1], pivot=[0.5, 0.5, 0.5]),
+        PinnedRegion(ball, front=[[1, 0, 0]], end=1.0),
         Impulse(ball, [0, 0, 0.1]),
         Plane([0, 0, -1], [0, 0, 1]),
         EnclosingBox([-2, -2, -2], [3, 3, 3]),

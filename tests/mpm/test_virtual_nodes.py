@@ -23,7 +23,7 @@ from gaussian_swaying.geometry.regions import Sphere
 from gaussian_swaying.mpm.colliders import Obstacle, Plane, VelocityBox
 from gaussian_swaying.mpm.contact import Surface
 from gaussian_swaying.mpm.embedded import EmbeddedInGrid, on_material
-from gaussian_swaying.mpm.pins import Handle, RigidRegion
+from gaussian_swaying.mpm.pins import RigidRegion
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.transfer import shifts
 from gaussian_swaying.mpm.virtual_nodes import coordinates, first_nodes, point_with_nodes, virtual_nodes
@@ -175,7 +175,7 @@ def test_small_pieces_in_any_orientation_move_as_alone(how, turn):
 
 
 BOUNDARIES = {
-    "handle": lambda: Handle(EDGE, velocity=[0.0, 0.3, 0.0]),
+    "handle": lambda: PinnedRegion(EDGE, velocity=[0.0, 0.3, 0.0]),
     "points": lambda: PinnedPoints([[0.5, 1.0, 3.1], [0.5, 1.0, 3.3], [0.5, 3.0, 3.3]]),
     "clamped points": lambda: PinnedPoints([[0.5, 1.0, 3.1], [0.5, 2.0, 3.3]], "clamp"),
     "a pin with an end": lambda: PinnedRegion(EDGE, "hinge", end=0.1),

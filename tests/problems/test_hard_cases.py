@@ -33,7 +33,6 @@ from gaussian_swaying._fixed import changed
 from gaussian_swaying.geometry.linalg import determinant, matmul3
 from gaussian_swaying.mpm.colliders import EnclosingBox, Plane, VelocityBox
 from gaussian_swaying.mpm.laws import LAWS as KINDS
-from gaussian_swaying.mpm.pins import Handle
 from gaussian_swaying.scenes import FlagScene, GivenScene
 from gaussian_swaying.simulation.measure import measure
 from gaussian_swaying.wind.field import FlowKey, Modulation
@@ -493,11 +492,8 @@ def test_a_sheet_twisted_by_720_degrees(formulation):
     middle = [0.0, 0.025, width / 2]
     ends = [
         PinnedRegion(up_to(x=0.11), "nodes"),
-        Handle(
-            Box([0.69, None, None], [None, None, None]),
-            kind="nodes",
-            angular_velocity=[4 * math.pi, 0, 0],
-            pivot=middle,
+        PinnedRegion(
+            Box([0.69, None, None], [None, None, None]), "nodes", angular_velocity=[4 * math.pi, 0, 0], pivot=middle
         ),
     ]
     points = _points(position, density=100.0, youngs_modulus=1e4)
@@ -524,8 +520,8 @@ def test_a_block_crushed_to_a_tenth_and_let_go(law, formulation):
     position = _lattice(3, 3, 6)
     fast = 0.9 * 0.3 / 2 / 0.1
     grips = [
-        Handle(up_to(z=0.06), velocity=[0, 0, fast], kind="nodes", end=0.1),
-        Handle(Box([None, None, 0.24], [None, None, None]), velocity=[0, 0, -fast], kind="nodes", end=0.1),
+        PinnedRegion(up_to(z=0.06), "nodes", velocity=[0, 0, fast], end=0.1),
+        PinnedRegion(Box([None, None, 0.24], [None, None, None]), "nodes", velocity=[0, 0, -fast], end=0.1),
     ]
     points = _points(position, law=KINDS[law]())
     simulation = _simulation(points, grips, formulation=formulation, frame_dt=5e-3, damping=60.0)

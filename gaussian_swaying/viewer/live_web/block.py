@@ -109,6 +109,8 @@ def _check_boundary(boundary: Any) -> None:
     if type(boundary) not in (PinnedRegion, PinnedPoints, Plane):
         known = ", ".join(one.__name__ for one in (PinnedRegion, PinnedPoints, Plane, Obstacle, *OBSTACLES))
         raise _refused(f"the {name} in `solver.boundaries`", f"take one of {known}")
+    if boundary.moves:
+        raise _refused(f"the `velocity` of the {name}", "leave it out")
     if type(boundary) is not Plane and not boundary.always:
         raise _refused(f"`start` and `end` of the {name}", "leave them out")
 

@@ -20,7 +20,7 @@ from gaussian_swaying.interop.physgaussian import PhysGaussianCamera, convert, h
 from gaussian_swaying.mpm.colliders import EnclosingBox, Plane, VelocityBox
 from gaussian_swaying.mpm.laws.law import lame_parameters
 from gaussian_swaying.mpm.laws.plastic import Foam, Metal, Plasticine, Sand, Snow
-from gaussian_swaying.mpm.pins import Handle, PinnedRegion, SequentialRelease
+from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation.model import Normalisation, rotation_matrix
 from gaussian_swaying.simulation.simulation import Simulation
@@ -252,7 +252,7 @@ def test_published_numbers_of_single_conditions(tmp_path):
     assert ficus.material.regions[0].density == 70.0
     assert _parts(PUBLISHED["wolf"], tmp_path).material.law.friction_angle == 30.0
     phases = list(_parts(PUBLISHED["vasedeck"], tmp_path).solver.boundaries)[:4]
-    assert [type(p) for p in phases] == [Handle, PinnedRegion, Handle, PinnedRegion]
+    assert [p.moves for p in phases] == [True, False, True, False]
     assert [(p.start, p.end) for p in phases] == [(0.0, 0.3), (0.3, 0.6), (0.6, 0.9), (0.9, 1.2)]
 
 
@@ -494,7 +494,7 @@ def test_planes_are_what_they_are_named_unless_asked(tmp_path):
 def test_the_front_follows_physgaussians_layers(first, last, tmp_path):
     """Against the boxes that PhysGaussian takes away one after the other; a layer leaves within its own time."""
     (release,) = _one(_released(first, last, 7), tmp_path)
-    assert isinstance(release, SequentialRelease)
+    assert isinstance(release, PinnedRegion)
     along = first + (last - first) * torch.linspace(0.01, 0.99, 197, dtype=torch.float64)
     points = torch.stack([along, torch.full_like(along, 0.3), torch.full_like(along, 1.7)], -1)
     expected = torch.zeros_like(along)
@@ -509,7 +509,7 @@ def test_the_front_follows_physgaussians_layers(first, last, tmp_path):
 
 def test_a_pull_becomes_a_handle(tmp_path):
     (handle,) = _one(_pulled([1, 1.25, 1], [1, 0.1, 1], [0, 0.2, 0], end_time=2.2), tmp_path)
-    assert isinstance(handle, Handle)
+    assert isinstance(handle, PinnedRegion)
     assert isinstance(handle.region, Box)
     assert handle.velocity.tolist() == [0, 0.2, 0]
     assert handle.end == 2.2

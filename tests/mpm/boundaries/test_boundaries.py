@@ -238,11 +238,10 @@ def test_region_that_holds_nothing_names_its_condition(name, framed):
         MPMSolver(0.1, boundaries=[boundary]).init_state(points, frame=frame)
 
 
-@pytest.mark.parametrize("kind", ["PinnedRegion", "Handle", "SequentialRelease"])
-def test_share_that_no_node_reaches_names_its_condition(kind):
+def test_share_that_no_node_reaches_names_its_condition():
     """One particle among many at a node: it holds less than the share."""
-    pin = changed(BOUNDARIES[kind](Sphere([0.2333, 0.2333, 0.2333], 0.03), kind="nodes"), pinned_share=0.9)
-    with value_error(rf"no grid node.*enlarge `region` of the {kind}"):
+    pin = changed(BOUNDARIES["PinnedRegion"](Sphere([0.2333, 0.2333, 0.2333], 0.03), kind="nodes"), pinned_share=0.9)
+    with value_error(r"no grid node.*enlarge `region` of the PinnedRegion"):
         MPMSolver(0.4, boundaries=[pin]).init_state(block())
 
 
@@ -259,13 +258,13 @@ REFUSED = [
     ("PinnedPoints", ([],), {}, "at"),
     ("PinnedPoints", ([[0, 0]],), {}, "at"),
     ("PinnedPoints", ([ZERO], "nodes"), {}, "kind"),
-    ("Handle", (BALL, [1, 2]), {}, "velocity"),
-    ("Handle", (BALL,), {"angular_velocity": [1, 2]}, "angular_velocity"),
-    ("Handle", (BALL,), {"pivot": [1, 2, 3, 4]}, "pivot"),
-    ("SequentialRelease", (BALL, ZERO), {}, "direction"),
-    ("SequentialRelease", (BALL, [1, 0]), {}, "direction"),
-    ("SequentialRelease", (BALL,), {"first": ZERO}, "first"),
-    ("SequentialRelease", (BALL, UNIT), {"first": UNIT, "last": [5, 0, 1]}, "last"),
+    ("PinnedRegion", (BALL,), {"velocity": [1, 2]}, "velocity"),
+    ("PinnedRegion", (BALL,), {"angular_velocity": [1, 2]}, "angular_velocity"),
+    ("PinnedRegion", (BALL,), {"pivot": [1, 2, 3, 4]}, "pivot"),
+    ("PinnedRegion", (BALL,), {"front": [ZERO], "end": 1.0}, "front"),
+    ("PinnedRegion", (BALL,), {"front": [[1, 0]], "end": 1.0}, "front"),
+    ("PinnedRegion", (BALL,), {"front": [UNIT, UNIT], "end": 1.0}, "front"),
+    ("PinnedRegion", (BALL,), {"front": [UNIT]}, "end"),
     ("Impulse", (BALL, [1, 0, 0]), {"end": math.inf}, "end"),
     ("Impulse", (BALL, [1, 0]), {}, "impulse"),
     ("Impulse", (BALL, [1, 0, 0]), {"start": 1.0}, "end"),

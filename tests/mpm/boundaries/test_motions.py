@@ -11,7 +11,7 @@ from torch.testing import assert_close
 
 from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion, SimFrame, Sphere
 from gaussian_swaying._fixed import changed
-from gaussian_swaying.mpm.pins import Handle, Impulse, SequentialRelease
+from gaussian_swaying.mpm.pins import Impulse
 
 from .bodies import block, lone, march, run_for
 
@@ -23,7 +23,7 @@ def test_handle_carries_its_particles_and_the_others_follow(formulation):
     rest, velocity = points.position, double([0.4, -0.2, 0.3])
     top = rest[:, 2] > 0.3
     above, times = beyond(z=0.3), {"start": 0.0099, "end": 0.0499}
-    handle = changed(Handle(above, velocity.tolist(), kind="nodes", **times), pinned_share=0.0)
+    handle = changed(PinnedRegion(above, "nodes", velocity=velocity.tolist(), **times), pinned_share=0.0)
     solver = MPMSolver(0.1, formulation, boundaries=[handle], gravity=ZERO)
     dt = 2e-3
     states = march(solver, points, dt, 50)
@@ -49,7 +49,7 @@ def test_handle_turns_twice_without_growing(formulation):
     points = block(per_side=3, side=0.3, e=2e3)  # what is held does not deform
     spin, pivot = double([[1.0, 2.0, -2.0], [0.1, 0.3, 0.2]])
     rate, substeps = 3.0, 160
-    handle = Handle(Sphere([0, 0, 0], 9.0), angular_velocity=spin.tolist(), pivot=pivot.tolist(), kind="nodes")
+    handle = PinnedRegion(Sphere([0, 0, 0], 9.0), "nodes", angular_velocity=spin.tolist(), pivot=pivot.tolist())
     solver = MPMSolver(0.1, formulation, boundaries=[handle])
     dt = 4 * math.pi / rate / substeps
     states = march(solver, points, dt, substeps)
@@ -71,7 +71,9 @@ def test_handle_in_a_frame_that_scales_and_turns(formulation):
     position = frame.point_to_sim(scene)
     points = solid(position, 1e-3)
     pivot, velocity = [7.1, 7.2, 6.5], double([0.2, 0.4, -0.6])
-    handle = Handle(Box([6, 6, 6], [8, 8, 8]), velocity.tolist(), [0.0, 0.0, 4.0], pivot, start=0.04)
+    handle = PinnedRegion(
+        Box([6, 6, 6], [8, 8, 8]), velocity=velocity.tolist(), angular_velocity=[0.0, 0.0, 4.0], pivot=pivot, start=0.04
+    )
     solver = MPMSolver(0.1, formulation, boundaries=[handle], gravity=ZERO)
     dt = 4e-3
     states = march(solver, points, dt, 60, frame=frame)
@@ -92,7 +94,7 @@ def test_handle_without_any_motion_is_a_pin(formulation):
     """To the bit in torch; the kernels of `total` hold a pin themselves, and leave a handle to torch."""
     points, region = block(), beyond(z=0.3)
     for transfer, tolerance in (("torch", 0.0), ("kernels", 1e-12)):
-        handle = run_for(formulation, [Handle(region)], points, 0.1, transfer=transfer)
+        handle = run_for(formulation, [PinnedRegion(region)], points, 0.1, transfer=transfer)
         pin = run_for(formulation, [PinnedRegion(region)], points, 0.1, transfer=transfer)
         near(handle.position, pin.position, tolerance)
         near(handle.F_elastic, pin.F_elastic, tolerance)
@@ -110,7 +112,7 @@ def test_scenes_of_a_batch_have_their_own_impulse_and_front(formulation):
     states = march(solver, points, 0.01, 5)
     expected = double([[1.0, 0, 0], [1, 0, 0], [0, 0, 0]])
     near(solver.momenta(states[-1])["linear"], expected, 1e-12)
-    release = SequentialRelease(region, [1, 0, 0], 0.0, 0.04)
+    release = PinnedRegion(region, front=[[1, 0, 0]], start=0.0, end=0.04)
     solver = MPMSolver(0.1, formulation, boundaries=[release])
     fall = march(solver, points, 0.01, 3)[-1].velocity[..., 2]
     # at 0.03 s the first of three has fallen for 3 substeps and the second, released at 0.02 s, for 1
@@ -123,7 +125,7 @@ def test_scenes_of_a_batch_have_their_own_impulse_and_front(formulation):
 def test_release_passes_over_lone_particles_in_order(formulation, direction):
     """Each falls for exactly the substeps since the front met it; the others fall from the beginning."""
     points = lone([[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [1, 1, 0], [0, 9, 0]])
-    release = SequentialRelease(up_to(y=5), direction, start=0.055, end=0.355)
+    release = PinnedRegion(up_to(y=5), front=[direction], start=0.055, end=0.355)
     solver = MPMSolver(0.1, formulation, boundaries=[release])
     along = points.position[:5] @ double(direction)
     part = (along - along.min()) / (along.max() - along.min())
@@ -141,7 +143,7 @@ def test_release_passes_over_lone_particles_in_order(formulation, direction):
 def test_release_lets_layers_of_a_block_fall_in_order(formulation, sign):
     points = block(e=2e3)
     rest = points.position
-    release = SequentialRelease(Sphere([0, 0, 0], 9.0), [sign, 0, 0], start=0.03, end=0.13, kind="nodes")
+    release = PinnedRegion(Sphere([0, 0, 0], 9.0), "nodes", front=[[sign, 0, 0]], start=0.03, end=0.13)
     solver = MPMSolver(0.1, formulation, boundaries=[release])
     dt = 5e-3
     states = march(solver, points, dt, 45)
@@ -159,7 +161,7 @@ def test_release_lets_layers_of_a_block_fall_in_order(formulation, sign):
 
 
 def test_release_of_a_single_layer_is_at_its_start():
-    release = SequentialRelease(Sphere([0, 0, 0], 9.0), [0, 0, 1], start=0.25, end=2.0)
+    release = PinnedRegion(Sphere([0, 0, 0], 9.0), front=[[0, 0, 1]], start=0.25, end=2.0)
     assert release.release_time(torch.rand(5, 3) * torch.tensor([1.0, 1, 0])).tolist() == [0.25] * 5
 
 
@@ -168,9 +170,7 @@ def test_release_between_given_points(up):
     """The front meets them at its start and end, in any frame, and independently of the other particles."""
     scene = double([[-1.0, 5, 0], [0.5, 0, 1], [1.0, 2, 9], [2.0, 0, 0], [3.5, 0, 0]])
     frame = SimFrame.fit(scene, up=up, metres_per_unit=0.5)
-    release = SequentialRelease(
-        Sphere([0, 0, 0], 99.0), [2.0, 0, 0], start=1.0, end=3.0, first=[0, 0, 0], last=[2, 7, 7]
-    ).in_frame(frame)
+    release = PinnedRegion(Sphere([0, 0, 0], 99.0), front=[[0, 0, 0], [2, 0, 0]], start=1.0, end=3.0).in_frame(frame)
     expected = [0.0, 1.5, 2.0, 3.0, 4.5]
     assert release.release_time(frame.point_to_sim(scene)).tolist() == pytest.approx(expected)
     assert release.release_time(frame.point_to_sim(scene[1:2])).tolist() == pytest.approx([1.5])

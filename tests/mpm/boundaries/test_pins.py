@@ -35,8 +35,6 @@ from gaussian_swaying.mpm.colliders import Obstacle, Plane
 from gaussian_swaying.mpm.pins import (
     MOST_ROWS,
     SOFTENED,
-    Handle,
-    SequentialRelease,
     along_face,
     face,
     thickness,
@@ -284,7 +282,7 @@ def test_a_handle_moves_its_points_exactly(kind):
     """720 degrees about a travelling pivot; a clamp also turns the deformation gradient."""
     points = _sheet(layers=3)
     velocity, pivot, rate, steps, dt = [0.2, -0.1, 0.3], [0.1, 0.05, 0.02], 2 * math.pi, 2000, 1e-3
-    handle = Handle(TOP, velocity, [0.0, 0.0, rate], pivot, kind)
+    handle = PinnedRegion(TOP, kind, velocity=velocity, angular_velocity=[0.0, 0.0, rate], pivot=pivot)
     solver = MPMSolver(DX, boundaries=[handle])
     states = _run(solver, points, steps, dt, every=500)
     rest = _own_places(solver)
@@ -306,8 +304,8 @@ def test_a_handle_moves_its_points_exactly(kind):
 def test_of_two_boundaries_at_the_same_place_the_last_one_counts():
     points = _sheet()
     for boundaries, speed in (
-        ([PinnedRegion(TOP), Handle(TOP, [0, 1, 0])], 1.0),
-        ([Handle(TOP, [0, 1, 0]), PinnedRegion(TOP)], 0.0),
+        ([PinnedRegion(TOP), PinnedRegion(TOP, velocity=[0, 1, 0])], 1.0),
+        ([PinnedRegion(TOP, velocity=[0, 1, 0]), PinnedRegion(TOP)], 0.0),
     ):
         solver = MPMSolver(DX, boundaries=boundaries)
         state = _run(solver, points, 2)[-1]
@@ -354,7 +352,7 @@ def test_pins_act_within_their_windows():
 
 def test_points_are_released_one_by_one():
     points = _sheet(width=12)
-    release = SequentialRelease(TOP, [1.0, 0.0, 0.0], start=0.02, end=0.12)
+    release = PinnedRegion(TOP, front=[[1.0, 0.0, 0.0]], start=0.02, end=0.12)
     solver = MPMSolver(DX, boundaries=[release])
     states = _run(solver, points, 160)
     rest, when = _own_places(solver), _rows(solver).release
@@ -476,7 +474,7 @@ def test_scenes_of_a_batch_are_independent():
 def test_the_kind_suits_the_formulation():
     points = _sheet()
     for formulation, kinds in (("total", ("hinge", "hinge", "nodes")), ("updated", ("nodes", "nodes", "nodes"))):
-        boundaries = [PinnedRegion(TOP), Handle(TOP), Plane([0, 0, -9], [0, 0, 1])]
+        boundaries = [PinnedRegion(TOP), PinnedRegion(TOP, angular_velocity=[0, 0, 1]), Plane([0, 0, -9], [0, 0, 1])]
         assert _started(points, *boundaries, formulation=formulation).bound.kinds == kinds
 
 
@@ -503,13 +501,10 @@ UPDATED = {"formulation": "updated"}
     ("pin", "settings", "message"),
     [
         (
-            kind(TOP, kind="clamp"),
+            PinnedRegion(TOP, kind="clamp"),
             UPDATED,
-            rf"`kind: clamp` of the {kind.__name__} needs .* set `kind` to nodes, or `solver.formulation` to total",
-        )
-        for kind in (PinnedRegion, Handle, SequentialRelease)
-    ]
-    + [
+            r"`kind: clamp` of the PinnedRegion needs .* set `kind` to nodes, or `solver.formulation` to total",
+        ),
         (
             PinnedPoints([[0, 0, 0]]),
             UPDATED,
@@ -534,7 +529,7 @@ def test_what_cannot_be_pinned_is_refused(pin, settings, message, monkeypatch):
 
 
 def test_only_what_has_a_target_moves():
-    assert Handle(TOP).moves
+    assert PinnedRegion(TOP, velocity=[0, 1, 0]).moves
     assert not PinnedRegion(TOP).moves
     assert not PinnedPoints([[0, 0, 0]]).moves
 
@@ -650,7 +645,7 @@ def test_the_default_holds_a_sheet_by_a_hinge_and_a_solid_by_a_clamp():
     kinds = {}
     for name, sides in (("sheet", (12, 12, 0.5)), ("solid", (12, 2, 2)), ("cord", (12, 0.5, 0.5))):
         rest = _box(*sides)
-        solver = _started(_material(rest), PinnedRegion(up_to(x=0.07)), Handle(Everything()))
+        solver = _started(_material(rest), PinnedRegion(up_to(x=0.07)), PinnedRegion(Everything()))
         kinds[name] = solver.bound.kinds[0]
     assert kinds == {"sheet": "hinge", "solid": "face", "cord": "face"}
 

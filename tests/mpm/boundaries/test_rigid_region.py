@@ -12,7 +12,7 @@ from torch.testing import assert_close
 from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedPoints, PinnedRegion
 from gaussian_swaying.geometry.regions import Everything, HalfSpace, Union
 from gaussian_swaying.mpm.colliders import Obstacle
-from gaussian_swaying.mpm.pins import Handle, RigidRegion
+from gaussian_swaying.mpm.pins import RigidRegion
 
 RIGHT = beyond(x=0.2)
 
@@ -110,7 +110,7 @@ def test_a_pin_of_no_kind_holds_the_nodes_of_a_rigid_part():
 
 @in_both
 def test_a_handle_leads_the_whole_part(formulation):
-    handle = Handle(beyond(x=0.3), angular_velocity=[0, 0, 2.0], pivot=[0.4, 0, 0], kind="nodes")
+    handle = PinnedRegion(beyond(x=0.3), "nodes", angular_velocity=[0, 0, 2.0], pivot=[0.4, 0, 0])
     points, solver = bar(RigidRegion(RIGHT), handle, formulation=formulation, gravity=ZERO)
     state = advance(solver, solver.init_state(points), 0.25)
     s, c = math.sin(0.5), math.cos(0.5)

@@ -43,8 +43,8 @@ from .bodies import (
 )
 
 WINDOW = {"start": 0.5 * DT, "end": 1.5 * DT}  # of three substeps the first and the last lie outside
-HANDLE = made("Handle", LEFT, [0.5, 0.0, 0.2], [0.0, 30.0, 9.0], [0.1, 0.1, 0.1])
-RELEASE = made("SequentialRelease", LEFT, [0.0, 1.0, 0.0], end=1.5 * DT)
+HANDLE = made("PinnedRegion", LEFT, velocity=[0.5, 0.0, 0.2], angular_velocity=[0.0, 30.0, 9.0], pivot=[0.1, 0.1, 0.1])
+RELEASE = made("PinnedRegion", LEFT, front=[[0.0, 1.0, 0.0]], end=1.5 * DT)
 HINGE, NODES = made("PinnedRegion", LEFT), made("PinnedRegion", LEFT, "nodes")
 SLOPE = made("Plane", [0.0, 0.0, 0.13], [0.1, 0.0, 1.0])
 FLOOR = made("Plane", [0.0, 0.0, 0.13], [0.0, 0.0, 1.0], "sticky")
@@ -89,7 +89,7 @@ BOUNDARIES = {
     ],
     "pin and plane": lambda: [NODES(), FLOOR()],
     "knock and release": lambda: [
-        made("SequentialRelease", LEFT, end=1.5 * DT)(),
+        made("PinnedRegion", LEFT, front=[[0.0, 0.0, 1.0]], end=1.5 * DT)(),
         made("Impulse", Everything(), [0, 0, 0.02], end=DT)(),
     ],
     "release and plane": lambda: [RELEASE(), made("Plane", [0.0, 0.0, 0.13], [0.0, 0.0, 1.0])()],
@@ -103,7 +103,15 @@ POINT_HOLDS = {  # for `total` alone
     "points one after the other": lambda: [
         HINGE(end=1.5 * DT),
         ONE(kind="clamp", start=0.5 * DT),
-        made("Handle", TOP, [0.5, 0.0, 0.2], [0.0, 30.0, 9.0], [0.1, 0.1, 0.1], "clamp", start=1.5 * DT)(),
+        made(
+            "PinnedRegion",
+            TOP,
+            "clamp",
+            velocity=[0.5, 0.0, 0.2],
+            angular_velocity=[0.0, 30.0, 9.0],
+            pivot=[0.1, 0.1, 0.1],
+            start=1.5 * DT,
+        )(),
     ],
 }
 OTHERS = {  # obstacles for `updated` alone, where they stop nodes; wind on a rigid part differs

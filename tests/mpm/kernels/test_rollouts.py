@@ -24,7 +24,6 @@ from gaussian_swaying.geometry.regions import Sphere
 from gaussian_swaying.mpm import run, total, updated
 from gaussian_swaying.mpm.colliders import EnclosingBox, Obstacle, Plane, VelocityBox
 from gaussian_swaying.mpm.laws.plastic import Sand
-from gaussian_swaying.mpm.pins import Handle
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.simulation.measure import measure
 from gaussian_swaying.wind.field import FlowKey
@@ -151,7 +150,7 @@ def _gusty():
 REPLAYED = {
     "a hinge": {"boundaries": lambda: [PinnedRegion(LEFT)]},
     "nodes, crowded cells": {"boundaries": lambda: [PinnedRegion(LEFT, "nodes")], "count": 40},
-    "a handle": {"boundaries": lambda: [Handle(LEFT, [0.5, 0.0, 0.2])]},
+    "a handle": {"boundaries": lambda: [PinnedRegion(LEFT, velocity=[0.5, 0.0, 0.2])]},
     "a batch": {"boundaries": lambda: [PinnedRegion(LEFT)], "batch": (2,)},
     "no wind": {"boundaries": lambda: [], "wind": False},
 }
@@ -193,7 +192,14 @@ def test_a_replayed_rollout_follows_what_changes(kernel_device, formulation):
     points = make_points(kernel_device, count=12)
     schedule = WindField(schedule=[FlowKey(0.005, [30.0, 0.0, 0.0])])
     load, other = make_load(points), make_load(points, schedule, seed=7, C_D=2.0)
-    turning = Handle(LEFT, [0.5, 0.0, 0.2], [0.0, 9.0, 3.0], [0.1, 0.1, 0.1], start=1e-4, end=5.5 * DT)
+    turning = PinnedRegion(
+        LEFT,
+        velocity=[0.5, 0.0, 0.2],
+        angular_velocity=[0.0, 9.0, 3.0],
+        pivot=[0.1, 0.1, 0.1],
+        start=1e-4,
+        end=5.5 * DT,
+    )
 
     def run(solver, state):
         states = [solver.rollout(state, DT, 2, load) for _ in range(3)]

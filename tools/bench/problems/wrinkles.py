@@ -21,7 +21,7 @@ from torch import Tensor
 from bench.problems.settings import Result, Settings, follow
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.boundary import Boundary
-from gaussian_swaying.mpm.pins import Handle, PinnedRegion
+from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MPMState
 from gaussian_swaying.scenes.procedural import FlagScene
@@ -108,8 +108,8 @@ def wrinkles(
     omega = math.pi / free * math.sqrt(strip.stretch * strip.strain / strip.mass)
     pull = PULL / omega
     speed = strip.strain * free / 2 / pull
-    boundaries: list[Boundary] = [Handle(ends[0], [-speed, 0.0, 0.0], kind="clamp", end=pull)]
-    boundaries.append(Handle(ends[1], [speed, 0.0, 0.0], kind="clamp", end=pull))
+    boundaries: list[Boundary] = [PinnedRegion(ends[0], "clamp", velocity=[-speed, 0.0, 0.0], end=pull)]
+    boundaries.append(PinnedRegion(ends[1], "clamp", velocity=[speed, 0.0, 0.0], end=pull))
     boundaries += [PinnedRegion(end, "clamp", start=pull) for end in ends]
     material = Material(E=strip.stretch / THICK, nu=strip.nu, density=strip.mass / THICK, thickness=THICK,
                         bending=bending)  # fmt: skip
