@@ -76,8 +76,8 @@ def conditions(region):
         "front": made("PinnedRegion", region, front=front, end=1.0),
         "impulse": made("Impulse", region, [0.1, 0.2, 0.3]),
         "impulse for each": made("Impulse", region, [0.01, 0.02, 0.03], per_particle=True),
-        "plane": made("Plane", [0.11, 0.12, 0.23], [0.0, 1.0, 1.5], "slip", 0.3),
-        "box": made("EnclosingBox", [-0.13, 0.07, 0.13], [0.33, 0.43, 0.51], "separate", 0.3),
+        "plane": made("Wall", HalfSpace([0.11, 0.12, 0.23], [0.0, 1.0, 1.5]), "slip", 0.3),
+        "box": made("Wall", Box([-0.13, 0.07, 0.13], [0.33, 0.43, 0.51]), "separate", 0.3),
         "velocity": made("VelocityBox", region, [0.1, 0.2, 0.3]),
         "velocity that travels": made("VelocityBox", region, [0.1, 0.2, 0.3], travels=True),
     }

@@ -20,6 +20,8 @@ GONE = {
     **{f"{name}Scene": f"DemoScene with `kind: {kind}` and `count`" for name, kind in _KINDS.items()},
     "ClothScene": "DemoScene with `kind` cloth_over_ball, cloth_over_table, ball_on_cloth or two_flags, and `size`",
     **{f"{name}Obstacle": f"Obstacle with `shape: {name}`" for name in ("Box", "Capsule", "HalfSpace", "Mesh")},
+    "EnclosingBox": "Wall with `shape: Box`",
+    "Plane": "Wall with `shape: HalfSpace`",
     "Handle": "PinnedRegion with `velocity`, `angular_velocity` and `pivot`",
     "SequentialRelease": "PinnedRegion with a `front`",
     "KeyframedCamera": "LookAtCamera with `keys`",

@@ -318,7 +318,7 @@ def _window(take: Fields, required: bool) -> dict[str, Any]:
 def _bounding_box(space: Turned) -> list[dict[str, Any]]:
     # half a cell beyond the last stopped node, since faces exactly on nodes would depend on round-off
     low, high = (PADDING - 0.5) * space.dx, space.grid_lim - (PADDING + 0.5) * space.dx
-    return [part("EnclosingBox", min=[round(low, 12)] * 3, max=[round(high, 12)] * 3, kind="separate")]
+    return [part("Wall", shape=part("Box", min=[round(low, 12)] * 3, max=[round(high, 12)] * 3), kind="separate")]
 
 
 def _cuboid(take: Fields, space: Turned) -> list[dict[str, Any]]:
@@ -399,7 +399,8 @@ def _plane(take: Fields, sticky: bool, notes: Notes) -> dict[str, Any]:
         notes.add(f"`surface`: the {surface} plane is sticky, as in PhysGaussian's code.")
     elif kind != "sticky":
         notes.add(f"`surface`: the plane is {kind} here; PhysGaussian's code makes every plane sticky.")
-    return part("Plane", point=list(point), normal=list(normal), kind=kind, friction=friction, **_window(take, True))
+    shape = part("HalfSpace", point=list(point), normal=list(normal))
+    return part("Wall", shape=shape, kind=kind, friction=friction, **_window(take, True))
 
 
 def _release(take: Fields, notes: Notes) -> dict[str, Any]:

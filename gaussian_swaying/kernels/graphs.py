@@ -245,7 +245,7 @@ class Repeater:
                 if "out of memory" in what:
                     raise torch.OutOfMemoryError(
                         f"The GPU has no memory left to record a substep on a grid of this size ({what}): stop "
-                        "particles that fly away with an EnclosingBox or a Plane, or raise `solver.dx`."
+                        "particles that fly away with a Wall, or raise `solver.dx`."
                     ) from error
                 if "captur" not in str(error):  # not a problem of the recording
                     raise

@@ -22,7 +22,7 @@ from gaussian_swaying.geometry.distance import DistanceGrid, distance_at, half_s
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.keyed_path import KeyedPath, between, fastest
 from gaussian_swaying.geometry.linalg_triton import add3, dot3, matvec, read, transpose
-from gaussian_swaying.geometry.regions import Region
+from gaussian_swaying.geometry.regions import Box, HalfSpace, Region
 from gaussian_swaying.geometry.rotations import rotation_of
 from gaussian_swaying.kernels.derive import on_tensors
 from gaussian_swaying.kernels.language import tl, triton
@@ -109,12 +109,12 @@ def plane_velocity(velocity: Tensor, normal: Tensor, kind: str, friction: float)
     return torch.stack(on_tensors(stopped)(v, n, KINDS.index(kind), friction), -1)
 
 
-class Plane(Boundary):
-    """A half space that particles cannot enter.
+class Wall(Boundary):
+    """What particles cannot enter or leave: a half space, or a box that keeps them inside, by conditions on nodes.
 
     Args:
-        point: A point of the plane, in scene units.
-        normal: Normal towards the free side, in scene axes.
+        shape: A ``HalfSpace`` that they cannot enter, or a ``Box`` that they cannot leave, in scene units; a null in
+            its corners leaves that side open.
         kind: ``sticky``, ``slip`` or ``separate`` (see :func:`plane_velocity`).
         friction: Coulomb friction coefficient of ``slip`` and ``separate``.
         start: Time from which it acts [s].
@@ -126,8 +126,7 @@ class Plane(Boundary):
 
     def __init__(
         self,
-        point: Sequence[float],
-        normal: Sequence[float],
+        shape: Region,
         kind: str = "separate",
         friction: float = 0.0,
         start: float = 0.0,
@@ -136,79 +135,51 @@ class Plane(Boundary):
         super().__init__(start, end)
         check_choice("kind", kind, KINDS)
         check_positive("friction", friction, allow_zero=True)
-        self.kind, self.friction = kind, float(friction)
-        n = torch.tensor(check_vector("normal", normal), dtype=torch.float64)
-        if float(n.norm()) == 0:
-            raise ValueError("Expected `normal` of the plane not to be zero.")
-        self.register_buffer("point", torch.tensor(check_vector("point", point), dtype=torch.float64))
-        self.register_buffer("normal", n / n.norm())
+        self.shape, self.kind, self.friction = shape, kind, float(friction)
+        if not isinstance(shape, HalfSpace | Box):
+            raise ValueError(f"Expected `shape` of the Wall to be a HalfSpace or a Box, but got {shape!r}.")
+        planes = []
+        for axis, unit in enumerate(torch.eye(3).tolist()):
+            for corner, way in ((shape.min, 1.0), (shape.max, -1.0)) if isinstance(shape, Box) else ():
+                if math.isfinite(corner[axis]):
+                    side = HalfSpace([corner[axis] * part for part in unit], [way * part for part in unit])
+                    planes.append(Wall(side, kind, friction, start, end))
+        self.planes = FixedList(planes)
+        if isinstance(shape, HalfSpace):
+            n = torch.tensor(shape.normal, dtype=torch.float64)
+            self.register_buffer("point", torch.tensor(shape.point, dtype=torch.float64))
+            self.register_buffer("normal", n / n.norm())
         self.point: Tensor
         self.normal: Tensor
 
-    def in_frame(self, frame: SimFrame) -> Plane:
-        """The plane in metres, z up."""
+    @property
+    def sides(self) -> Sequence[Wall]:
+        """The planes of a box, or itself."""
+        return list(self.planes) or [self]  # type: ignore[arg-type]
+
+    def in_frame(self, frame: SimFrame) -> Wall:
+        """The wall in metres, z up."""
+        if self.planes:
+            return changed(self, planes=FixedList(p.in_frame(frame) for p in self.planes))  # type: ignore[operator]
         normal = frame.direction_to_sim(self.normal).clone()
         return self.copy_in(frame, point=frame.point_to_sim(self.point), normal=normal)
 
     def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
+        for plane in self.planes:
+            velocity = plane(velocity, nodes)
+        if self.planes:
+            return velocity
         assert nodes.position is not None
         behind = ((nodes.position - self.point.to(velocity)) * self.normal.to(velocity)).sum(-1) <= 0
         stopped = plane_velocity(velocity, self.normal, self.kind, self.friction)
         return torch.where((behind & self.active(nodes.time))[..., None], stopped, velocity)
 
     def device_function(self) -> DeviceFunction:
+        """That of the half space; of a box nothing but that of each plane."""
+        if self.planes:
+            return DeviceFunction(None, parts=tuple(plane.device_function() for plane in self.planes))  # type: ignore[operator]
         solid = DeviceFunction(half_space_distance, numbers=Numbers(3, lambda: self.normal), sources=(self,))
         return _placed(solid, 0.0, self.friction, self.point)
-
-
-class EnclosingBox(Boundary):
-    """Six planes that keep the particles inside an axis-aligned box.
-
-    Args:
-        min: Smallest corner, in scene units.
-        max: Largest corner, in scene units.
-        kind: ``sticky``, ``slip`` or ``separate``.
-        friction: Coulomb friction coefficient of ``slip`` and ``separate``.
-        start: Time from which it acts [s].
-        end: Time from which it no longer acts [s]; None for never.
-    """
-
-    needs_position = True
-    recordable = True
-
-    def __init__(
-        self,
-        min: Sequence[float],
-        max: Sequence[float],
-        kind: str = "separate",
-        friction: float = 0.0,
-        start: float = 0.0,
-        end: float | None = None,
-    ) -> None:
-        super().__init__(start, end)
-        low, high = check_vector("min", min), check_vector("max", max)
-        if any(a >= b for a, b in zip(low, high, strict=True)):
-            raise ValueError(f"Expected `min` of the box to be below `max` on every axis, but got {low} and {high}.")
-        planes = []
-        for axis in range(3):
-            direction = [0.0, 0.0, 0.0]
-            direction[axis] = 1.0
-            planes.append(Plane(low, direction, kind, friction, start, end))
-            planes.append(Plane(high, [-d for d in direction], kind, friction, start, end))
-        self.planes = FixedList(planes)
-
-    def in_frame(self, frame: SimFrame) -> EnclosingBox:
-        """The box in metres, z up."""
-        return changed(self, planes=FixedList(p.in_frame(frame) for p in self.planes))  # type: ignore[operator]
-
-    def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
-        for plane in self.planes:
-            velocity = plane(velocity, nodes)
-        return velocity
-
-    def device_function(self) -> DeviceFunction:
-        """Nothing but that of each plane."""
-        return DeviceFunction(None, parts=tuple(plane.device_function() for plane in self.planes))  # type: ignore[operator]
 
 
 class VelocityBox(Boundary):
@@ -254,7 +225,7 @@ class Obstacle(Boundary):
     """A rigid body, fixed or moving, that the material cannot enter, with Coulomb friction.
 
     In ``total`` it stops contact samples of the body's surface, at the obstacle's own surface
-    (:mod:`~gaussian_swaying.mpm.contact`). In ``updated`` it stops grid nodes, as a ``Plane`` does, so the gap is up to
+    (:mod:`~gaussian_swaying.mpm.contact`). In ``updated`` it stops grid nodes, as a ``Wall`` does, so the gap is up to
     a cell wide.
 
     Args:
@@ -411,7 +382,7 @@ def _placed(solid: DeviceFunction, gap: float, friction: float, centre: Tensor) 
     return replace(solid, numbers=Numbers(5 + own.count, numbers))
 
 
-Solid = Plane | Obstacle
+Solid = Wall | Obstacle
 
 
 def solids_of(boundaries: Sequence[Boundary], pins: Container[int] = ()) -> list[tuple[Solid, int]] | None:
@@ -424,4 +395,5 @@ def solids_of(boundaries: Sequence[Boundary], pins: Container[int] = ()) -> list
     others = [(one, k) for k, one in enumerate(boundaries) if k not in pins]
     if any(boundary.device_function() is None for boundary, _ in others):
         return None
-    return [(part, k) for one, k in others for part in one.modules() if isinstance(part, Solid)]
+    solids = [(part, k) for one, k in others for part in one.modules() if isinstance(part, Solid)]
+    return [(part, k) for part, k in solids if isinstance(part, Obstacle) or not part.planes]

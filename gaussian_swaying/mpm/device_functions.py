@@ -11,7 +11,7 @@ for which the function is compiled; the last of them is its parts, a :class:`Com
 - Effect of the wind: ``(velocity, position, numbers, now, table, OPTIONS)`` returns the changed velocity.
 - Boundary: a solid. ``(place, numbers, table, mask, OPTIONS)`` returns the signed distance from it, at rest, and its
   normal at places from its centre; ``mask`` is for loads. Motion, gap, friction and time window are those of every
-  ``Obstacle`` or ``Plane``.
+  ``Obstacle`` or ``Wall``.
 """
 
 from __future__ import annotations

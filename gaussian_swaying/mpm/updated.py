@@ -16,7 +16,7 @@ from gaussian_swaying.geometry.rigid import centre
 from gaussian_swaying.kernels.launch import LANES, lanes, launch, wide
 from gaussian_swaying.mpm import updated_kernels as kernels
 from gaussian_swaying.mpm.boundary import Boundary
-from gaussian_swaying.mpm.colliders import KINDS, Plane, solids_of
+from gaussian_swaying.mpm.colliders import KINDS, Wall, solids_of
 from gaussian_swaying.mpm.contact import Surface
 from gaussian_swaying.mpm.damping import kelvin_voigt_pk1
 from gaussian_swaying.mpm.device_functions import Packed
@@ -240,7 +240,7 @@ class UpdatedRun(Run):
         solids = [part for part, _ in parts or []]
         self.solids = Packed(torch.Size([1]), self.like, fixed=True)
         self.own_solids = [found for one in solids if (found := one.device_function()) is not None]
-        self.kinds = tuple(KINDS.index(one.kind if isinstance(one, Plane) else "separate") for one in solids)
+        self.kinds = tuple(KINDS.index(one.kind if isinstance(one, Wall) else "separate") for one in solids)
         pins = pins if parts is not None else {}
         self.pinned = [(held.mass > 0).reshape(-1).to(torch.int8) for held in pins.values()]
         """For each pin, the particles that it holds."""

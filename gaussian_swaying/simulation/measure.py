@@ -423,7 +423,7 @@ def _raise_if_bad(solver: Solver, verdict: list[float], time: float) -> None:
         ) + ", or check the wind and the boundary velocities"
     elif wrong == _LOST:
         cause = f"it left the grid ({lost} particles did)"
-        remedy = "enclose the scene with an EnclosingBox or a Plane, or lower the speeds that carry it away"
+        remedy = "enclose the scene with a Wall, or lower the speeds that carry it away"
     else:
         cause = f"it is more than {FARTHEST} object sizes ({verdict[3]:.3g} m) away from where it started"
         remedy = "pin or enclose the object, or lower `solver.cfl`"

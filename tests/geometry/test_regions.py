@@ -9,7 +9,7 @@ from shared import double, value_error, without_waits
 from gaussian_swaying import Box, Cylinder, Sphere
 from gaussian_swaying._fixed import changed
 from gaussian_swaying.gaussians.selection import select_simulated
-from gaussian_swaying.geometry.regions import Everything, Not, Region, Union
+from gaussian_swaying.geometry.regions import Capsule, Everything, HalfSpace, Not, Region, StillGaussians, Union
 
 
 def _inside(region, *points):
@@ -33,6 +33,15 @@ def test_cylinder_is_centred_and_takes_any_axis():
     assert _inside(cylinder, (1.4, 0, 0.9), (1.4, 0, -0.9), (1, 0, 1.1), (1.6, 0, 0)) == [True, True, False, False]
     slanted = Cylinder([0, 0, 0], [1, 1, 0], radius=0.1, height=4)
     assert _inside(slanted, (1, 1, 0), (1, 1.2, 0), (2, 2, 0)) == [True, False, False]
+
+
+def test_the_shapes_of_obstacles_are_regions_as_well():
+    """Their surfaces included: a rod with round ends, and all that is behind a plane."""
+    rod = Capsule([0, 0, 0], [2, 0, 0], 0.5)
+    assert _inside(rod, (1, 0.49, 0), (2.4, 0, 0), (2.4, 0.4, 0), (1, 0.51, 0)) == [True, True, False, False]
+    assert _inside(HalfSpace([0, 0, 1], [0, 0, 2]), (9, 9, 1), (0, 0, -9), (0, 0, 1.01)) == [True, True, False]
+    with value_error("not a region"):
+        _inside(StillGaussians(), (0, 0, 0))
 
 
 def test_combinations():
@@ -100,6 +109,9 @@ REFUSED = [
     (Cylinder, (ZERO, ZERO, 1, 1), ValueError, "`axis`"),
     (Cylinder, (ZERO, UNIT, -1, 1), ValueError, "`radius`"),
     (Cylinder, (ZERO, UNIT, 1, 0), ValueError, "`height`"),
+    (Capsule, (ZERO, UNIT, -1.0), ValueError, "`radius`"),
+    (HalfSpace, (ZERO, ZERO), ValueError, "`normal`"),
+    (HalfSpace, ([0, 0], UNIT), ValueError, "`point`"),
     (Union, ([],), ValueError, "`regions`"),
     (Union, ([3],), TypeError, "`regions` of Union to be a list of Regions, but got"),
     (Union, (Everything(),), TypeError, "`regions` of Union to be a list"),

@@ -9,8 +9,8 @@ from shared import beyond, in_both, without_waits
 
 from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.geometry.regions import Cylinder, Everything, Not, Sphere, Union
-from gaussian_swaying.mpm.colliders import EnclosingBox, Plane, VelocityBox
+from gaussian_swaying.geometry.regions import Box, Cylinder, Everything, HalfSpace, Not, Sphere, Union
+from gaussian_swaying.mpm.colliders import VelocityBox, Wall
 from gaussian_swaying.mpm.pins import Impulse, PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
@@ -63,8 +63,8 @@ def test_a_step_never_makes_the_host_wait(formulation):
         PinnedRegion(corner, velocity=[0.1, 0, 0], angular_velocity=[0, 0, 1], pivot=[0.5, 0.5, 0.5]),
         PinnedRegion(ball, front=[[1, 0, 0]], end=1.0),
         Impulse(ball, [0, 0, 0.1]),
-        Plane([0, 0, -1], [0, 0, 1]),
-        EnclosingBox([-2, -2, -2], [3, 3, 3]),
+        Wall(HalfSpace([0, 0, -1], [0, 0, 1])),
+        Wall(Box([-2, -2, -2], [3, 3, 3])),
         *(VelocityBox(region, [0, 0, 0.1]) for region in (corner, ball, rod, Union([ball, rod]), Not(Everything()))),
     ]
     solver = MPMSolver(0.2, formulation, boundaries=boundaries)

@@ -17,7 +17,7 @@ from gaussian_swaying.wind.field import Modulation
 
 def test_what_is_here_can_be_recorded():
     concrete = [*BOUNDARIES.values(), SineSway, UniformGust, GaussianGust]
-    assert len(concrete) == 11
+    assert len(concrete) == 10
     assert all(kind.recordable for kind in concrete if kind is not VelocityBox)  # which asks its region
 
 

@@ -19,8 +19,8 @@ from gaussian_swaying import (
     WindForce,
 )
 from gaussian_swaying.geometry.linalg import polar_rotation
-from gaussian_swaying.geometry.regions import Sphere
-from gaussian_swaying.mpm.colliders import Obstacle, Plane, VelocityBox
+from gaussian_swaying.geometry.regions import HalfSpace, Sphere
+from gaussian_swaying.mpm.colliders import Obstacle, VelocityBox, Wall
 from gaussian_swaying.mpm.contact import Surface
 from gaussian_swaying.mpm.embedded import EmbeddedInGrid, on_material
 from gaussian_swaying.mpm.pins import RigidRegion
@@ -67,7 +67,7 @@ def test_one_piece_is_the_same_bit_for_bit(transfer, how):
     if how == "pairs":
         near = (position[:, None] - position).norm(dim=-1) < 0.8
         attached = near.nonzero()
-    pins = [PinnedRegion(EDGE), Plane([0, 0, 2.9], [0, 0, 1])]
+    pins = [PinnedRegion(EDGE), Wall(HalfSpace([0, 0, 2.9], [0, 0, 1]))]
     plain, known = (rolled(material(position, a), transfer=transfer, boundaries=pins)[2] for a in (None, attached))
     assert known.grid == plain.grid
     for one, other in zip(fields(plain), fields(known), strict=True):
@@ -181,7 +181,7 @@ BOUNDARIES = {
     "a pin with an end": lambda: PinnedRegion(EDGE, "hinge", end=0.1),
     "a box of velocities": lambda: VelocityBox(Box([3.0, None, None], [5.0, None, None]), [0.1, 0.0, 0.2]),
     "a rigid part": lambda: RigidRegion(beyond(x=5.0)),
-    "ground": lambda: Plane([0, 0, 3.05], [0, 0, 1]),
+    "ground": lambda: Wall(HalfSpace([0, 0, 3.05], [0, 0, 1])),
 }
 
 

@@ -31,7 +31,8 @@ from gaussian_swaying import (
 )
 from gaussian_swaying._fixed import changed
 from gaussian_swaying.geometry.linalg import determinant, matmul3
-from gaussian_swaying.mpm.colliders import EnclosingBox, Plane, VelocityBox
+from gaussian_swaying.geometry.regions import HalfSpace
+from gaussian_swaying.mpm.colliders import VelocityBox, Wall
 from gaussian_swaying.mpm.laws import LAWS as KINDS
 from gaussian_swaying.scenes import FlagScene, GivenScene
 from gaussian_swaying.simulation.measure import measure
@@ -330,7 +331,7 @@ def test_a_body_thrown_on_a_plane_at_50_metres_per_second(law, formulation):
     kind, given, stiffness = LAWS[law]
     position = _lattice(3, 3, 3, low=(0, 0, 0.05))
     points = _points(position, law=KINDS[kind](*given), youngs_modulus=stiffness)
-    plane = Plane([0, 0, 0], [0, 0, 1])
+    plane = Wall(HalfSpace([0, 0, 0], [0, 0, 1]))
     simulation = _simulation(points, [plane], formulation=formulation, frame_dt=2e-3, gravity=UP)
     state, log = _advance(simulation, 6, _throw(simulation, [0.0, 0.0, -50.0]))
     _assert_no_gain(log)
@@ -586,7 +587,7 @@ def test_a_body_that_spreads_beyond_the_largest_grid_is_reported(monkeypatch):
 )
 def test_an_energetic_body_in_a_closed_box(law, formulation):
     """5 m/s into a corner, half a second: it stays inside, and never has more energy than it came with."""
-    box = EnclosingBox([0, 0, 0], [0.6, 0.6, 0.6])
+    box = Wall(Box([0, 0, 0], [0.6, 0.6, 0.6]))
     position = _lattice(3, 3, 3, low=(0.2, 0.2, 0.2))
     simulation = _simulation(_points(position, law=KINDS[law]()), [box], formulation=formulation, frame_dt=0.02)
     state, log = _advance(simulation, 15, _throw(simulation, [5.0, 4.0, 3.0]))

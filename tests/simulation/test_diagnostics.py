@@ -7,7 +7,8 @@ import pytest
 import torch
 from shared import double, in_both, rand, randn, seeded, up_to, waits
 
-from gaussian_swaying.mpm.colliders import Plane
+from gaussian_swaying.geometry.regions import HalfSpace
+from gaussian_swaying.mpm.colliders import Wall
 from gaussian_swaying.mpm.laws.elastic import FixedCorotated
 from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.mpm.pins import PinnedRegion
@@ -75,7 +76,7 @@ def test_numbers_of_a_known_state():
 
 def test_forces_on_supports(make_simulation):
     """The momentum that each boundary took in the frame over its time; a plane far away takes none."""
-    pin, plane = PinnedRegion(up_to(x=0.11)), Plane([0, 0, -9], [0, 0, 1])
+    pin, plane = PinnedRegion(up_to(x=0.11)), Wall(HalfSpace([0, 0, -9], [0, 0, 1]))
     simulation = make_simulation(pinned=False, boundaries=[pin, plane])
     before = simulation.start()
     after, health = simulation.advance(before)
@@ -157,7 +158,7 @@ def test_what_is_worst_is_named_first():
     solver, state = _solver()
     lost = torch.zeros(30, dtype=torch.bool)
     lost[[5, 6]] = True
-    _refused(solver, state.replace(lost=lost), r"particle 5: it left the grid \(2 particles did\).*EnclosingBox")
+    _refused(solver, state.replace(lost=lost), r"particle 5: it left the grid \(2 particles did\).*Wall")
     position = state.position.clone()
     position[5] = math.inf
     bad = state.replace(lost=lost, position=position)

@@ -11,8 +11,8 @@ from small_scenes import guess, plain_cloud, started, together
 
 from gaussian_swaying.config.parser import parse_text
 from gaussian_swaying.gaussians.measures import Gaussians
-from gaussian_swaying.geometry.regions import Box, Cylinder, Everything, Not, Union
-from gaussian_swaying.mpm.colliders import Plane
+from gaussian_swaying.geometry.regions import Box, Cylinder, Everything, HalfSpace, Not, Union
+from gaussian_swaying.mpm.colliders import Wall
 from gaussian_swaying.mpm.materials import MATERIALS
 from gaussian_swaying.mpm.pins import Impulse, PinnedRegion
 from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
@@ -139,7 +139,7 @@ def test_lines_are_where_the_renderer_draws():
 
 def test_parts_are_those_of_the_run(make_simulation):
     boundaries = [PinnedRegion(POLE), Impulse(beyond(x=0.8), [0, 0, 1]),
-                  Plane([0, 0, -9], [0, 0, 1])]  # fmt: skip
+                  Wall(HalfSpace([0, 0, -9], [0, 0, 1]))]  # fmt: skip
     cloud = FlagScene(spacing=0.1).generate()
     cloud.opacities[-8:] = -6.0  # the last column is faint
     simulation = make_simulation(cloud=cloud, pinned=False, boundaries=boundaries, scene={"region": Not(
@@ -149,7 +149,7 @@ def test_parts_are_those_of_the_run(make_simulation):
     assert torch.equal(roles.carried, (z < 0.6) & (x > 1.1))
     assert torch.equal(roles.pinned, (x < 0.11) & (z < 0.6))
     assert torch.equal(roles.pushed, (x > 0.8) & (x < 1.1) & (z < 0.6))
-    assert roles.names == ["PinnedRegion: 6 particles", "Impulse: 18 particles", "Plane"]
+    assert roles.names == ["PinnedRegion: 6 particles", "Impulse: 18 particles", "Wall"]
 
 
 def test_flow_is_the_strongest_of_a_schedule(make_simulation):

@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.geometry.regions import Box, Capsule, HalfSpace, Sphere
-from gaussian_swaying.mpm.boundary import Boundary
-from gaussian_swaying.mpm.colliders import Obstacle, Plane
+from gaussian_swaying.mpm.colliders import Obstacle, Wall
 from gaussian_swaying.mpm.laws.elastic import FixedCorotated, NeoHookean, SpringNetwork, StVKHencky
 from gaussian_swaying.mpm.modes import Modes
 from gaussian_swaying.mpm.pins import PinnedPoints, PinnedRegion
@@ -106,12 +105,12 @@ def _check_boundary(boundary: Any) -> None:
             return
         if not boundary.still:
             raise _refused(f"the `path` of the {name}", "leave it out")
-    if type(boundary) not in (PinnedRegion, PinnedPoints, Plane):
-        known = ", ".join(one.__name__ for one in (PinnedRegion, PinnedPoints, Plane, Obstacle, *OBSTACLES))
+    if type(boundary) not in (PinnedRegion, PinnedPoints, Wall):
+        known = ", ".join(one.__name__ for one in (PinnedRegion, PinnedPoints, Wall, Obstacle, *OBSTACLES))
         raise _refused(f"the {name} in `solver.boundaries`", f"take one of {known}")
     if boundary.moves:
         raise _refused(f"the `velocity` of the {name}", "leave it out")
-    if type(boundary) is not Plane and not boundary.always:
+    if type(boundary) is not Wall and not boundary.always:
         raise _refused(f"`start` and `end` of the {name}", "leave them out")
 
 
@@ -156,8 +155,8 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
     held = torch.zeros_like(bound.node_mass, dtype=torch.bool)
     planes, obstacles = [], []
     for boundary, own, acts in zip(bound.boundaries, bound.pinned, bound.on_nodes, strict=True):
-        if isinstance(boundary, Plane):
-            planes.append(_plane(boundary))
+        if isinstance(boundary, Wall):
+            planes += [_plane(side) for side in boundary.sides]
         elif isinstance(boundary, Obstacle):
             obstacles.append(_obstacle(boundary))
         elif acts:
@@ -251,8 +250,7 @@ def _joined(head: dict[str, Any], arrays: dict[str, Tensor]) -> bytes:
     return message(head | {"arrays": listed}, *blocks)
 
 
-def _plane(plane: Boundary) -> dict[str, Any]:
-    assert isinstance(plane, Plane)
+def _plane(plane: Wall) -> dict[str, Any]:
     return {
         "point": plane.point.tolist(),
         "normal": plane.normal.tolist(),

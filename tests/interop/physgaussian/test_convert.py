@@ -17,7 +17,7 @@ from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.interop.physgaussian import PhysGaussianCamera, convert, heading, read_model_camera, to_yaml
-from gaussian_swaying.mpm.colliders import EnclosingBox, Plane, VelocityBox
+from gaussian_swaying.mpm.colliders import VelocityBox, Wall
 from gaussian_swaying.mpm.laws.law import lame_parameters
 from gaussian_swaying.mpm.laws.plastic import Foam, Metal, Plasticine, Sand, Snow
 from gaussian_swaying.mpm.pins import PinnedRegion
@@ -463,7 +463,7 @@ def test_a_moving_cuboid_travels_and_its_reset_keeps_everything_at_rest(tmp_path
 
 def test_the_bounding_box_stops_three_nodes_at_each_side(tmp_path):
     (box,) = _one({"type": "bounding_box"}, tmp_path, n_grid=40)  # dx = 0.05
-    assert isinstance(box, EnclosingBox)
+    assert isinstance(box, Wall)
     nodes = torch.arange(40) * 0.05
     for axis in range(3):
         low, high = box.planes[2 * axis], box.planes[2 * axis + 1]
@@ -478,7 +478,7 @@ def test_planes_are_what_they_are_named_unless_asked(tmp_path):
     _, notes = convert(config)
     assert any("PhysGaussian's code makes every plane sticky" in note for note in notes)
     (made,) = PARSER.instantiate(_settings(config, tmp_path=tmp_path)).solver.boundaries
-    assert isinstance(made, Plane)
+    assert isinstance(made, Wall)
     assert (made.kind, made.friction, made.normal.tolist()) == ("slip", 0.3, [0, 0, 1])
     (stuck,) = _parts(config, tmp_path, sticky_planes=True).solver.boundaries
     assert (stuck.kind, stuck.friction) == ("sticky", 0.0)

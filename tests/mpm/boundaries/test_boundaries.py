@@ -15,9 +15,9 @@ from torch.testing import assert_close
 from gaussian_swaying import Box, Cylinder, MPMSolver, SimFrame, Sphere
 from gaussian_swaying._fixed import changed
 from gaussian_swaying.geometry.keyed_path import KeyedPath
-from gaussian_swaying.geometry.regions import Everything, Not, Union
+from gaussian_swaying.geometry.regions import Everything, HalfSpace, Not, Union
 from gaussian_swaying.mpm.boundary import Nodes
-from gaussian_swaying.mpm.colliders import Plane, VelocityBox, plane_velocity
+from gaussian_swaying.mpm.colliders import VelocityBox, Wall, plane_velocity
 
 from .bodies import block, lone, march, run_for
 
@@ -82,9 +82,9 @@ def test_plane_and_box_leave_alone_what_is_near_but_free(formulation, kind, fric
     """Less than 1.5 cells away and coming closer, yet no node at or behind the plane: a rigid flight."""
     points = block(low=(0.16, 0.16, 0.16), per_side=4)
     low, high = 0.05, 0.65
-    plane = BOUNDARIES["Plane"]([0, 0, low], [0, 0, 2], kind, friction)
-    ceiling = BOUNDARIES["Plane"]([0, 0, high], [0, 0, -1], kind, friction)
-    for boundary in (plane, ceiling, BOUNDARIES["EnclosingBox"]([low] * 3, [high] * 3, kind, friction)):
+    plane = BOUNDARIES["Wall"](HalfSpace([0, 0, low], [0, 0, 2]), kind, friction)
+    ceiling = BOUNDARIES["Wall"](HalfSpace([0, 0, high], [0, 0, -1]), kind, friction)
+    for boundary in (plane, ceiling, BOUNDARIES["Wall"](Box([low] * 3, [high] * 3), kind, friction)):
         for sign in (1.0, -1.0):
             velocity = sign * double([0.3, -0.2, 0.25]).expand_as(points.position)
             state = run_for(formulation, [boundary], points, 0.04, velocity, gravity=(0, 0, 0))
@@ -92,13 +92,13 @@ def test_plane_and_box_leave_alone_what_is_near_but_free(formulation, kind, fric
 
 
 @in_both
-@pytest.mark.parametrize("wall", [("Plane", [0, 0, 0.11], [0, 0, 1]), ("EnclosingBox", [-9, -9, 0.11], [9] * 3)])
+@pytest.mark.parametrize("wall", [HalfSpace([0, 0, 0.11], [0, 0, 1]), Box([-9, -9, 0.11], [9] * 3)])
 def test_separate_lets_go_of_what_moves_away_and_slip_does_not(formulation, wall):
     points = block(low=(0, 0, 0.05))  # behind the wall lie the lowest nodes of either formulation
     velocity = double([0.3, 0.0, 1.0]).expand_as(points.position)
 
     def run(kind, friction=0.0):
-        boundary = made(*wall, kind, friction)()
+        boundary = made("Wall", wall, kind, friction)()
         return run_for(formulation, [boundary], points, 0.02, velocity, gravity=(0, 0, 0)).velocity
 
     near(run("separate"), velocity, 1e-12)
@@ -246,13 +246,12 @@ def test_share_that_no_node_reaches_names_its_condition():
 
 
 ZERO, UNIT, BALL = [0, 0, 0], [0, 0, 1], Sphere([0, 0, 0], 1)
+BELOW = HalfSpace(ZERO, UNIT)
 REFUSED = [
-    ("Plane", (ZERO, ZERO), {}, "normal"),
-    ("Plane", (ZERO, UNIT, "glue"), {}, "kind"),
-    ("Plane", ([0, 0], UNIT), {}, "point"),
-    ("Plane", (ZERO, UNIT), {"friction": -1}, "friction"),
-    ("Plane", (ZERO, UNIT), {"start": 1.0, "end": 1.0}, "end"),
-    ("EnclosingBox", (ZERO, [1, 0, 1]), {}, "min"),
+    ("Wall", (BELOW, "glue"), {}, "kind"),
+    ("Wall", (BALL,), {}, "shape"),
+    ("Wall", (BELOW,), {"friction": -1}, "friction"),
+    ("Wall", (BELOW,), {"start": 1.0, "end": 1.0}, "end"),
     ("VelocityBox", (BALL, [1, 2]), {}, "velocity"),
     ("PinnedRegion", (BALL, "glue"), {}, "kind"),
     ("PinnedPoints", ([],), {}, "at"),
@@ -348,7 +347,7 @@ def test_plane_velocity_kinds():
 
 @pytest.mark.parametrize("length", [1e-3, 1.0, 50.0])
 def test_the_length_of_the_normal_does_not_matter(length):
-    plane = Plane([0.0, 0.0, 0.0], [0.6 * length, 0.0, -0.8 * length])
+    plane = Wall(HalfSpace([0.0, 0.0, 0.0], [0.6 * length, 0.0, -0.8 * length]))
     assert_close(plane.normal, double([0.6, 0.0, -0.8]))
 
 
@@ -359,14 +358,14 @@ def test_block_slides_down_an_incline_with_coulombs_acceleration(formulation):
     gravity = (9.8 * math.sin(angle), 0.0, -9.8 * math.cos(angle))
     seconds = 0.4
     # the lowest nodes are in contact from the start, so nothing bounces
-    plane = Plane([0, 0, 0.06], [0, 0, 1], "separate", 0.2)
+    plane = Wall(HalfSpace([0, 0, 0.06], [0, 0, 1]), "separate", 0.2)
     x, _, z = run_for(formulation, [plane], points, seconds, gravity=gravity).velocity.mean(0).tolist()
     # mu times the momentum that the plane gave upwards, less what bulging turns aside, more at the slow start
     lost = 9.8 * seconds * math.sin(angle) - x
     assert lost == pytest.approx(0.2 * (9.8 * seconds * math.cos(angle) + z), rel=0.03)
     assert abs(z) < 0.05 * 9.8 * seconds
     # damped, so that it does not hop: with mu = 1 it leans by less than twice the static g sin m c, c as above
-    plane = Plane([0, 0, 0.06], [0, 0, 1], "separate", 1.0)
+    plane = Wall(HalfSpace([0, 0, 0.06], [0, 0, 1]), "separate", 1.0)
     held = run_for(formulation, [plane], points, seconds, gravity=gravity, damping=30.0)
     leans = 9.8 * math.sin(angle) * (0.4 * 2.6 + 0.6) * 0.4**2 * 100 / 2e4
     assert (held.position - points.position)[:, 0].mean() < 2 * leans

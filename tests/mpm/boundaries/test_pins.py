@@ -29,9 +29,9 @@ from torch.testing import assert_close
 
 from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedPoints, PinnedRegion, SimFrame, support_force
 from gaussian_swaying.geometry.keyed_path import KeyedPath
-from gaussian_swaying.geometry.regions import Everything, Sphere
+from gaussian_swaying.geometry.regions import Everything, HalfSpace, Sphere
 from gaussian_swaying.mpm import pins as pinning
-from gaussian_swaying.mpm.colliders import Obstacle, Plane
+from gaussian_swaying.mpm.colliders import Obstacle, Wall
 from gaussian_swaying.mpm.pins import (
     MOST_ROWS,
     SOFTENED,
@@ -44,6 +44,7 @@ from gaussian_swaying.mpm.transfer import bspline_stencil, gather
 
 DX, STEP = 0.1, 0.045
 TOP = beyond(z=-0.03)
+GROUND = Wall(HalfSpace([0, 0, -9], [0, 0, 1]))
 
 
 def _sheet(dtype=torch.float64, layers=1, width=8, height=10, turn=0.0, shift=(0.0, 0.0, 0.0), e=4e3):
@@ -264,7 +265,7 @@ def test_pins_in_the_same_cells_agree():
     points = _sheet()
     at = [[0.1, 0.0, -0.09], [0.2, 0.0, -0.15]]
     pins = [PinnedRegion(TOP), PinnedPoints(at), PinnedRegion(Box([0.3, None, -0.2], [None, None, -0.1]), "clamp")]
-    solver = MPMSolver(DX, boundaries=[*pins, Plane([0, 0, -0.42], [0, 0, 1], "slip")])
+    solver = MPMSolver(DX, boundaries=[*pins, Wall(HalfSpace([0, 0, -0.42], [0, 0, 1]), "slip")])
     state = _run(solver, points, 200, force=_push(points), every=200)[-1]
     places = _own_places(solver)
     assert len(places) >= 7
@@ -396,7 +397,7 @@ def test_supports_take_the_momentum_of_the_forces(formulation):
     """In every substep: momentum gained = gravity - what the boundaries took."""
     points = _sheet()
     ball = Obstacle(Sphere([0.2, 0.05, -0.3], 0.1), path=KeyedPath([0.0, 1.0], [[0, 0, 0], [0.1, -2.0, 0.3]]))
-    pins = [PinnedRegion(TOP), Plane([0, 0, -0.41], [0, 0, 1], "separate", 0.3), ball]
+    pins = [PinnedRegion(TOP), Wall(HalfSpace([0, 0, -0.41], [0, 0, 1]), "separate", 0.3), ball]
     solver = MPMSolver(DX, formulation, boundaries=pins)
     states = _run(solver, points, 60, 1e-3)
     weight = float(points.mass.sum()) * double([0, 0, -9.8])
@@ -474,7 +475,11 @@ def test_scenes_of_a_batch_are_independent():
 def test_the_kind_suits_the_formulation():
     points = _sheet()
     for formulation, kinds in (("total", ("hinge", "hinge", "nodes")), ("updated", ("nodes", "nodes", "nodes"))):
-        boundaries = [PinnedRegion(TOP), PinnedRegion(TOP, angular_velocity=[0, 0, 1]), Plane([0, 0, -9], [0, 0, 1])]
+        boundaries = [
+            PinnedRegion(TOP),
+            PinnedRegion(TOP, angular_velocity=[0, 0, 1]),
+            Wall(HalfSpace([0, 0, -9], [0, 0, 1])),
+        ]
         assert _started(points, *boundaries, formulation=formulation).bound.kinds == kinds
 
 

@@ -17,9 +17,9 @@ from gaussian_swaying import (
     WindField,
     WindForce,
 )
-from gaussian_swaying.geometry.regions import Sphere
+from gaussian_swaying.geometry.regions import HalfSpace, Sphere
 from gaussian_swaying.mpm import total
-from gaussian_swaying.mpm.colliders import Obstacle, Plane
+from gaussian_swaying.mpm.colliders import Obstacle, Wall
 from gaussian_swaying.wind.force import LAWS as WIND_LAWS
 from gaussian_swaying.wind.patches import Patches
 
@@ -236,7 +236,7 @@ def test_kernels_refuse_what_they_do_not_cover(kernel_device):
     _refused(solver, alone, match="the nodal ones do not")
     late = PinnedRegion(up_to(x=0.12), start=DT)
     _refused(*_free(kernel_device, boundaries=[late]), match="pins that hold all the time")
-    floor = Plane([0.0, 0.0, 0.0], [0.0, 0.0, 1.0])
+    floor = Wall(HalfSpace([0.0, 0.0, 0.0], [0.0, 0.0, 1.0]))
     ball = Obstacle(Sphere([0.2, 0.15, -0.1], 0.05))
     for boundary in (floor, ball):
         _refused(*_free(kernel_device, boundaries=[boundary]), match="pins that hold all the time, and contact")

@@ -15,7 +15,7 @@ from shared import ZERO, in_both, normalized, peak, seeded
 from gaussian_swaying import AeroForce, WindField, WindForce
 from gaussian_swaying._fixed import changed
 from gaussian_swaying.geometry.keyed_path import KeyedPath
-from gaussian_swaying.geometry.regions import Box, Capsule, Everything, Mesh, Sphere
+from gaussian_swaying.geometry.regions import Box, Capsule, Everything, HalfSpace, Mesh, Sphere
 from gaussian_swaying.kernels.launch import lanes
 from gaussian_swaying.mpm import total
 from gaussian_swaying.mpm.state import GridSpec
@@ -46,9 +46,9 @@ WINDOW = {"start": 0.5 * DT, "end": 1.5 * DT}  # of three substeps the first and
 HANDLE = made("PinnedRegion", LEFT, velocity=[0.5, 0.0, 0.2], angular_velocity=[0.0, 30.0, 9.0], pivot=[0.1, 0.1, 0.1])
 RELEASE = made("PinnedRegion", LEFT, front=[[0.0, 1.0, 0.0]], end=1.5 * DT)
 HINGE, NODES = made("PinnedRegion", LEFT), made("PinnedRegion", LEFT, "nodes")
-SLOPE = made("Plane", [0.0, 0.0, 0.13], [0.1, 0.0, 1.0])
-FLOOR = made("Plane", [0.0, 0.0, 0.13], [0.0, 0.0, 1.0], "sticky")
-BOX = made("EnclosingBox", [0.1, 0.1, 0.1], [0.2, 0.2, 0.2], "slip", 0.2)
+SLOPE = made("Wall", HalfSpace([0.0, 0.0, 0.13], [0.1, 0.0, 1.0]))
+FLOOR = made("Wall", HalfSpace([0.0, 0.0, 0.13], [0.0, 0.0, 1.0]), "sticky")
+BOX = made("Wall", Box([0.1, 0.1, 0.1], [0.2, 0.2, 0.2]), "slip", 0.2)
 ONE = made("PinnedPoints", [[0.2, 0.1, 0.1]])
 PATH = KeyedPath([DT, 30 * DT], [[0.0, 0.0, 0.0], [0.2, -0.1, 0.05]], [[0.0, 10.0, 20.0], [50.0, -20.0, 90.0]])
 
@@ -78,7 +78,7 @@ BOUNDARIES = {
     "box": lambda: [BOX()],
     "walls": lambda: [
         SLOPE(kind="sticky", **WINDOW),
-        made("EnclosingBox", [0.11, 0.1, 0.1], [0.2, 0.2, 0.2], "separate", 0.1, end=1.5 * DT)(),
+        made("Wall", Box([0.11, 0.1, 0.1], [0.2, 0.2, 0.2]), "separate", 0.1, end=1.5 * DT)(),
     ],
     "velocity box": lambda: [conditions(TOP)["velocity"](**WINDOW)],
     "walls and pins": lambda: [
@@ -92,7 +92,7 @@ BOUNDARIES = {
         made("PinnedRegion", LEFT, front=[[0.0, 0.0, 1.0]], end=1.5 * DT)(),
         made("Impulse", Everything(), [0, 0, 0.02], end=DT)(),
     ],
-    "release and plane": lambda: [RELEASE(), made("Plane", [0.0, 0.0, 0.13], [0.0, 0.0, 1.0])()],
+    "release and plane": lambda: [RELEASE(), made("Wall", HalfSpace([0.0, 0.0, 0.13], [0.0, 0.0, 1.0]))()],
 }
 POINT_HOLDS = {  # for `total` alone
     "clamp": lambda: [HINGE(kind="clamp")],

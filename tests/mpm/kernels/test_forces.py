@@ -6,10 +6,11 @@ from catalogue import ELASTIC, PLASTIC
 from shared import in_both
 
 from gaussian_swaying import Force, PinnedRegion, WindField
+from gaussian_swaying.geometry.regions import HalfSpace
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm import run as substeps
 from gaussian_swaying.mpm import updated
-from gaussian_swaying.mpm.colliders import Plane
+from gaussian_swaying.mpm.colliders import Wall
 from gaussian_swaying.mpm.device_functions import DeviceFunction, Numbers
 
 from .bodies import (
@@ -117,7 +118,7 @@ def test_forces_in_torch_among_the_kernels(kernel_device, formulation, case, mon
     The time passed to forces and boundaries advances once per substep; the internal variable is passed too.
     """
     name, resistance = case
-    plane = Plane([0.0, 0.0, 0.13], [0.1, 0.0, 1.0], "separate")
+    plane = Wall(HalfSpace([0.0, 0.0, 0.13], [0.1, 0.0, 1.0]), "separate")
     held = {"boundaries": [PinnedRegion(LEFT, start=1.5 * DT), plane]}
     monkeypatch.setattr(substeps, "MAX_STEPS", 3)
     monkeypatch.setattr(updated, "sorted_for", lambda *known: 2)

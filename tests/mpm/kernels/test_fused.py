@@ -12,9 +12,9 @@ from catalogue import ELASTIC, PLASTIC
 from shared import in_both, peak, value_error
 
 from gaussian_swaying import Boundary, MPMSolver, PinnedRegion, WindField, WindForce
-from gaussian_swaying.geometry.regions import Everything
+from gaussian_swaying.geometry.regions import Everything, HalfSpace
 from gaussian_swaying.mpm import run
-from gaussian_swaying.mpm.colliders import Plane
+from gaussian_swaying.mpm.colliders import Wall
 from gaussian_swaying.mpm.laws.elastic import FixedCorotated
 from gaussian_swaying.mpm.pins import Impulse
 
@@ -53,7 +53,7 @@ def test_one_solver_within_inference_mode_and_without(kernel_device, formulation
 def test_buffers_end_with_their_solver(kernel_device, formulation):
     """Immediately: a GPU may need their memory for the next one before Python collects cycles. Also if recorded."""
     points = make_points(kernel_device, count=12)
-    solver = make_solver("kernels", formulation, boundaries=[Plane([0, 0, 0.0], [0.0, 0, 1.0])])
+    solver = make_solver("kernels", formulation, boundaries=[Wall(HalfSpace([0, 0, 0.0], [0.0, 0, 1.0]))])
     solver.rollout(set_going(solver, points), DT, 2)
     buffer = weakref.ref(solver.kernels.load)
     gc.disable()

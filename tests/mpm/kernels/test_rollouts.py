@@ -20,9 +20,9 @@ from gaussian_swaying import (
     WindField,
 )
 from gaussian_swaying._fixed import assign
-from gaussian_swaying.geometry.regions import Sphere
+from gaussian_swaying.geometry.regions import HalfSpace, Sphere
 from gaussian_swaying.mpm import run, total, updated
-from gaussian_swaying.mpm.colliders import EnclosingBox, Obstacle, Plane, VelocityBox
+from gaussian_swaying.mpm.colliders import Obstacle, VelocityBox, Wall
 from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.simulation.measure import measure
@@ -227,7 +227,7 @@ def test_a_grid_that_comes_back(kernel_device):
     """A graph recorded for a grid finds its node positions again, even after another grid was used."""
     points = make_points(kernel_device)
     count = 4 if kernel_device.type == "cuda" else 1
-    boundaries = [Plane([0.0, 0.0, 0.13], [0.0, 0.0, 1.0])]
+    boundaries = [Wall(HalfSpace([0.0, 0.0, 0.13], [0.0, 0.0, 1.0]))]
     solvers = [make_solver(transfer, boundaries=boundaries) for transfer in ("torch", "kernels")]
     state, _ = (set_going(solver, points) for solver in solvers)
     load = make_load(points)
@@ -252,7 +252,7 @@ def test_grids_that_grow_take_the_memory_of_the_largest():
     pytest.importorskip("triton")
     points = _cloud(500)
     far = VelocityBox(Box([8.0] * 3, [9.0] * 3), [0.0, 1.0, 0.0])  # in torch, which takes the most memory
-    planes = [Plane([0.0, 0.0, -0.2], [0.0, 0.0, 1.0]), EnclosingBox([-9.0] * 3, [9.0] * 3), far]
+    planes = [Wall(HalfSpace([0.0, 0.0, -0.2], [0.0, 0.0, 1.0])), Wall(Box([-9.0] * 3, [9.0] * 3)), far]
 
     def most_reserved(sizes):
         solver = MPMSolver(0.02, "updated", transfer="kernels", boundaries=planes)
@@ -283,7 +283,7 @@ def test_a_cloud_that_flies_away_is_followed_in_bounded_memory(flight):
     points = _cloud(500)
     solver = MPMSolver(
         0.02, "updated", transfer="kernels", gravity=ZERO,
-        boundaries=[Plane([0.0, 0.0, -99.0], [0.0, 0.0, 1.0])],
+        boundaries=[Wall(HalfSpace([0.0, 0.0, -99.0], [0.0, 0.0, 1.0]))],
     )  # fmt: skip
     centre = points.position.mean(0)
     velocity = torch.ones_like(points.position) if flight == "drifts" else 3 * (points.position - centre)
@@ -313,7 +313,7 @@ BROKEN += [("velocity", -math.inf), ("velocity", 1e12), ("velocity", 1e30)]
 def test_a_broken_particle_is_reported_and_breaks_nothing_else(kernel_device, transfer, name, value):
     """Also within recorded substeps, and the device stays usable."""
     points, steps = make_points(kernel_device), 9 if kernel_device.type == "cuda" else 2
-    solver = make_solver(transfer, boundaries=[Plane([0.0, 0.0, -0.1], [0.0, 0.0, 1.0])])
+    solver = make_solver(transfer, boundaries=[Wall(HalfSpace([0.0, 0.0, -0.1], [0.0, 0.0, 1.0]))])
     start = solver.fit_grid(set_going(solver, points, strain=0.02), 0.04)
     end = good = solver.rollout(start, DT, steps)  # as it is, then recorded
     broken = getattr(start, name).clone()
@@ -356,7 +356,7 @@ BEHIND = PinnedRegion(up_to(x=0.12), "clamp")
 CASES = {
     "total": lambda: {"boundaries": [BEHIND]},
     "total with an obstacle": lambda: {"boundaries": [BEHIND, Obstacle(Sphere([0.5, 0.5, 0.1], 0.2), 0.4)]},
-    "updated": lambda: {"boundaries": [Plane([0.0, 0.0, 0.1], [0.1, 0.0, 1.0], "separate", 0.3)]},
+    "updated": lambda: {"boundaries": [Wall(HalfSpace([0.0, 0.0, 0.1], [0.1, 0.0, 1.0]), "separate", 0.3)]},
     "sand": lambda: {"boundaries": [PinnedRegion(up_to(x=0.12), "nodes")]},
 }
 

@@ -48,10 +48,8 @@ def test_longest_steps(make, in_node):
     assert told[0]["substeps"] < 0.75 * steps
 
 
-PLANE = {
-    "class_path": "Plane",
-    "init_args": {"point": [0, 0, -0.18], "normal": [0, 0.2, 1], "kind": "separate", "friction": 0.4},
-}
+BELOW = {"class_path": "HalfSpace", "init_args": {"point": [0, 0, -0.18], "normal": [0, 0.2, 1]}}
+PLANE = {"class_path": "Wall", "init_args": {"shape": BELOW, "friction": 0.4}}
 CLAMP = {"class_path": "PinnedRegion", "init_args": {"region": SIDE, "kind": "clamp"}}
 NODES = {"class_path": "PinnedRegion", "init_args": {"region": SIDE, "kind": "nodes"}}
 POINT = {"class_path": "PinnedPoints", "init_args": {"at": [[0.0, 0.0, 0.4]]}}

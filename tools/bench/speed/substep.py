@@ -10,7 +10,8 @@ from torch import Tensor
 
 from bench.runner import Row, study
 from bench.speed.timing import CUBE, DT, STEPS, load, sheet, timed, waves, wind
-from gaussian_swaying.mpm.colliders import EnclosingBox
+from gaussian_swaying.geometry.regions import Box
+from gaussian_swaying.mpm.colliders import Wall
 from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints
@@ -84,7 +85,7 @@ def substep(
 def cube(asked: int, device: str, turning: bool, walls: bool) -> Row:
     """An elastic cube with eight points in a cell, at rest or turning, with or without an enclosing box."""
     points = block(asked, 1 / 256, 0.1, device, density=1000.0, youngs_modulus=1e5)
-    box = [EnclosingBox([0.03] * 3, [1.6] * 3)] if walls else []
+    box = [Wall(Box([0.03] * 3, [1.6] * 3))] if walls else []
     solver = MPMSolver(dx=1 / 128, formulation="updated", boundaries=box, gravity=[0.0, 0.0, 0.0])
     arm = points.position - points.position.mean(0)
     spin = torch.linalg.cross(arm.new_tensor([0.6, 1.0, 2.0]).expand_as(arm), arm)

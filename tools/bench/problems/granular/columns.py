@@ -22,8 +22,9 @@ from bench.problems.granular.shared import (
     updated,
 )
 from bench.problems.settings import Axial, Result, Settings, follow, lattice
+from gaussian_swaying.geometry.regions import HalfSpace
 from gaussian_swaying.mpm.boundary import Boundary
-from gaussian_swaying.mpm.colliders import Plane
+from gaussian_swaying.mpm.colliders import Wall
 from gaussian_swaying.mpm.laws.law import lame_parameters
 from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.mpm.solver import MPMSolver
@@ -45,7 +46,7 @@ def column_at_rest(
     settings = updated(settings)
     dx = LENGTH / cells
     place = lattice(dx, (0, 0, 0), (cells, 0, cells), settings)
-    wall = Plane((LENGTH, 0, 0), (-1, 0, 0), "slip")
+    wall = Wall(HalfSpace((LENGTH, 0, 0), (-1, 0, 0)), "slip")
     solver, points, state = _column(place, dx, LENGTH, settings, (1,), friction_angle, walls=[wall], **more)
     run = follow(solver, state, seconds / 10, 10, lambda s: kinetic_energy(s, points))
     moved = torch.linalg.vector_norm(run.state.position - place, dim=-1).amax()
@@ -156,8 +157,8 @@ def _column(
         poisson_ratio=POISSON,
         law=Sand(friction_angle, volume_correction),
     )
-    floor = Plane((0, 0, 0), (0, 0, 1), "sticky")
-    sides: list[Boundary] = [Plane((0, 0, 0), (1, 0, 0), "slip")]
-    sides.append(Axial(held) if held else Plane((0, 0, 0), (0, 1, 0), "slip"))
+    floor = Wall(HalfSpace((0, 0, 0), (0, 0, 1)), "sticky")
+    sides: list[Boundary] = [Wall(HalfSpace((0, 0, 0), (1, 0, 0)), "slip")]
+    sides.append(Axial(held) if held else Wall(HalfSpace((0, 0, 0), (0, 1, 0)), "slip"))
     solver = settings.solver(dx, gravity=(0.0, 0.0, -GRAVITY), boundaries=[*sides, *walls, floor])
     return solver, points, consolidated(solver.init_state(points), points, height)

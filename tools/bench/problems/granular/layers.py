@@ -22,8 +22,9 @@ from bench.problems.granular.shared import (
     updated,
 )
 from bench.problems.settings import Result, Settings, follow, lattice
+from gaussian_swaying.geometry.regions import HalfSpace
 from gaussian_swaying.mpm.boundary import Boundary, Nodes
-from gaussian_swaying.mpm.colliders import Plane
+from gaussian_swaying.mpm.colliders import Wall
 from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
@@ -183,7 +184,7 @@ def _layer(
         poisson_ratio=POISSON,
         law=Sand(friction_angle, volume_correction),
     )
-    solver = settings.solver(dx, boundaries=[_Invariant(dx), Plane((0, 0, 0), (0, 0, 1), "sticky")], **more)
+    solver = settings.solver(dx, boundaries=[_Invariant(dx), Wall(HalfSpace((0, 0, 0), (0, 0, 1)), "sticky")], **more)
     return solver, points, consolidated(solver.init_state(points, margin=2), points, LENGTH)
 
 
