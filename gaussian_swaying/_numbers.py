@@ -58,7 +58,6 @@ SENSE = {
     "air_density": Sense("kg/m³", 0.0, 1e5),
     "added_mass": Sense("m", 0.0, 1e4),
     "air.speed": Sense("m/s", 1e-4, 1e4),
-    "air.lattice_speed": Sense("cells a step", 1e-3, 0.3),
     "copies.shift": Sense("m", -1e4, 1e4),
     "copies.turn": Sense("degrees", -1e6, 1e6),
     "copies.delay": Sense("s", -1e6, 1e6),

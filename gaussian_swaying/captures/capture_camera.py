@@ -18,7 +18,7 @@ from gaussian_swaying.geometry.origin import NO_ORIGIN, Origin
 from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_quat
 from gaussian_swaying.rendering.cameras.camera import NEAR, Camera, counted_pose, resized_intrinsics
 from gaussian_swaying.rendering.cameras.camera_path import CameraPath, check_picture
-from gaussian_swaying.rendering.cameras.keyframes import Interpolation, interpolate_keys
+from gaussian_swaying.rendering.cameras.keyframes import interpolate_keys
 from gaussian_swaying.rendering.cameras.transforms_json import camera_of_transforms, load_transforms
 
 
@@ -77,7 +77,6 @@ class CaptureCamera(CameraPath):
         view: Name of the view, with or without folder and extension, or its number from 0 when sorted by name; null to
             move through all views.
         seconds_per_view: Time from one view to the next [s]; the path ends at the last.
-        interpolation: Between views: ``smooth`` or ``linear``, as for LookAtCamera.
         width: Image width [pixels]; by default that of the capture.
         height: Image height [pixels]; by default that of the capture.
 
@@ -93,7 +92,6 @@ class CaptureCamera(CameraPath):
     view: int | str | None = None
     _: KW_ONLY
     seconds_per_view: float = 0.5
-    interpolation: Interpolation = "smooth"
     width: int | None = None
     height: int | None = None
 
@@ -115,7 +113,7 @@ class CaptureCamera(CameraPath):
         if len(self._cameras) == 1:
             return self._cameras[0].to(center.device, center.dtype)
         times = [k * self.seconds_per_view for k in range(len(self._cameras))]
-        row = torch.tensor(interpolate_keys(times, self._rows, time, self.interpolation), dtype=torch.float64)
+        row = torch.tensor(interpolate_keys(times, self._rows, time), dtype=torch.float64)
         eye, quat, (fx, fy, cx, cy) = row[:3], row[3:7], row[7:].tolist()
         world_to_camera = torch.eye(4, dtype=torch.float64)
         world_to_camera[:3, :3] = quat_to_rotation(quat)

@@ -45,7 +45,6 @@ class DemoScene(ProceduralScene):
         spacing: Distance between Gaussians [m]; None for that of its kind, as in the following.
         count: Number of leaves, of flowers, or of turns of the cord.
         size: Sides of a cloth [m], or the radius of the floor round an alocasia on which copies can stand.
-        seed: Seed of the growth or of the jitter.
     """
 
     kind: Literal[
@@ -55,22 +54,20 @@ class DemoScene(ProceduralScene):
     spacing: float | None = None
     count: int | None = None
     size: float | None = None
-    seed: int | None = None
 
     def __post_init__(self) -> None:
         given = self._given()
         for name, value in given.items():
             if name not in inspect.signature(MADE[self.kind]).parameters:
                 raise ValueError(f"`generator.{name}` means nothing for the kind `{self.kind}`: leave it out.")
-            if name != "seed":
-                check_positive(f"generator.{name}", value, allow_zero=name == "size")
+            check_positive(f"generator.{name}", value, allow_zero=name == "size")
         if given.get("spacing", 0) > 0.2:
             raise ValueError(f"Expected `generator.spacing` of at most 0.2 m, but got {self.spacing} m.")
         if self.kind == "leaves" and given.get("count", 150) < len(WOOD):
             raise ValueError(f"Expected `generator.count` of at least {len(WOOD)}, one a twig, but got {self.count}.")
 
     def _given(self) -> dict[str, Any]:
-        given = {name: getattr(self, name) for name in ("spacing", "count", "size", "seed")}
+        given = {name: getattr(self, name) for name in ("spacing", "count", "size")}
         return {name: value for name, value in given.items() if value is not None}
 
     def generate(self) -> GaussianCloud:

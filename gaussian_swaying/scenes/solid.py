@@ -25,6 +25,7 @@ FIGURE = (
     (-0.18, -0.26, 0.10, 0.12),
     (0.18, -0.26, 0.10, 0.12),
 )
+_JITTER = 0.3  # largest random shift of points of the lattice, per spacing
 _BLEND = 0.02  # radius over which the balls of the figure blend into each other, for a height of 1
 
 
@@ -66,7 +67,6 @@ class SolidScene(ProceduralScene):
         spacing: Distance between Gaussians [m], at most a quarter of the size.
         gaussians: ``throughout``, or ``shell`` for a hollow splat, as captures are.
         overlap: Standard deviation of a Gaussian as a share of the spacing.
-        jitter: Largest random shift of points of the lattice, from 0 to 1 times the spacing.
         seed: Seed of the jitter.
     """
 
@@ -75,7 +75,6 @@ class SolidScene(ProceduralScene):
     spacing: float = 0.02
     gaussians: Literal["throughout", "shell"] = "throughout"
     overlap: float = 0.6
-    jitter: float = 0.3
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -84,8 +83,6 @@ class SolidScene(ProceduralScene):
             raise ValueError(
                 f"Expected `generator.spacing` to be at most a quarter of the size, but got {self.spacing} m."
             )
-        if not 0 <= self.jitter <= 1:
-            raise ValueError(f"Expected `generator.jitter` to be from 0 to 1, but got {self.jitter}.")
 
     @property
     def distance(self) -> Callable[[Tensor], Tensor]:
@@ -106,7 +103,7 @@ class SolidScene(ProceduralScene):
         points = torch.cartesian_prod(steps, steps, steps)
         if self.shape == "figure":
             points[:, 2] += 0.5 * self.size
-        points += self.jitter * h * (torch.rand(points.shape, generator=draw, dtype=torch.float64) - 0.5)
+        points += _JITTER * h * (torch.rand(points.shape, generator=draw, dtype=torch.float64) - 0.5)
         distance = self.distance(points)
         skin = points[distance.abs() < 0.5 * h]
         for _ in range(8):  # onto the surface; for a true distance and away from edges once is enough

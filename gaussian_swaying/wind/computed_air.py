@@ -42,6 +42,8 @@ from gaussian_swaying.wind.tables import Shelter
 LEAST_CELLS = 8
 """Cells along the longest side of the body: with fewer, no wake of it is resolved."""
 
+LATTICE_SPEED = 0.1  # cells per step
+
 LIGHTEST = 0.02
 """Smallest ratio of the mass of a point to that of the layer of air that it moves."""
 
@@ -65,9 +67,9 @@ class ComputedAir(Fixed, nn.Module):
         still_walls: Whether the Gaussians of the scene that stand still are walls, at least a cell thick.
         viscosity: Kinematic viscosity of the air [m²/s].
         smagorinsky: Constant of the subgrid model; 0 for none, which is for low Reynolds numbers.
-        speed: Speed [m/s] that is ``lattice_speed`` cells per step; null for the largest of the wind without gusts, and
-            half as much again.
-        lattice_speed: The smaller it is, the smaller is the error of compressibility, and the more steps a frame takes.
+        speed: Speed [m/s] that is a tenth of a cell per step; null for the largest of the wind without gusts, and half
+            as much again. The larger it is, the smaller is the error of compressibility, and the more steps a frame
+            takes.
 
     Raises:
         ValueError: If a number is out of range.
@@ -86,7 +88,6 @@ class ComputedAir(Fixed, nn.Module):
         viscosity: float = 1.5e-5,
         smagorinsky: float = 0.1,
         speed: float | None = None,
-        lattice_speed: float = 0.1,
     ) -> None:
         super().__init__()
         self.low, self.high = check_vector("low", low), check_vector("high", high)
@@ -95,13 +96,12 @@ class ComputedAir(Fixed, nn.Module):
         check_whole("air.cells", cells, LEAST_CELLS)
         check_positive("air.viscosity", viscosity)
         check_positive("air.smagorinsky", smagorinsky, allow_zero=True)
-        check_positive("air.lattice_speed", lattice_speed)
         if speed is not None:
             check_positive("air.speed", speed)
         self.cells, self.force, self.ground, self.walls = cells, force, bool(ground), list(walls)
         self.still_walls = bool(still_walls)
         self.viscosity, self.smagorinsky = float(viscosity), float(smagorinsky)
-        self.speed, self.lattice_speed = speed, float(lattice_speed)
+        self.speed = speed
         if math.prod(self.counts()) > MOST_CELLS:
             raise ValueError(f"`air.cells` of {cells:,} makes more than {MOST_CELLS:,} cells in all: lower it.")
 
@@ -200,7 +200,7 @@ BYTES = 4 * 40 + 1 + 24
 
 
 def speed_of(settings: ComputedAir, wind: WindField) -> float:
-    """The speed [m/s] that is ``lattice_speed`` cells per step."""
+    """The speed [m/s] that is :data:`LATTICE_SPEED`."""
     speed = settings.speed or 1.5 * float(torch.linalg.vector_norm(wind.flows.detach(), dim=-1).amax())
     if not speed > 0:
         raise ValueError("Computed air in a still wind needs `air.speed`: the largest speed that is expected [m/s].")
@@ -209,7 +209,7 @@ def speed_of(settings: ComputedAir, wind: WindField) -> float:
 
 def steps_of(settings: ComputedAir, wind: WindField, frame_dt: float) -> int:
     """Steps of the air in a frame of ``frame_dt`` seconds."""
-    share = frame_dt * speed_of(settings, wind) / (settings.lattice_speed * settings.spacing)
+    share = frame_dt * speed_of(settings, wind) / (LATTICE_SPEED * settings.spacing)
     return max(math.ceil(share - 1e-9), 1)
 
 

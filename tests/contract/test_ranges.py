@@ -52,7 +52,6 @@ FAR, NEAR = [0.0] * 3, [1.0] * 3
         (lambda v: OrbitCamera(radius=v), "radius", (1e30, 1e-30)),
         (lambda v: Sphere(FAR, v), "radius", (1e30, 1e-30)),
         (lambda v: ComputedAir(FAR, NEAR, speed=v), "air.speed", (1e-9, 1e9)),
-        (lambda v: ComputedAir(FAR, NEAR, lattice_speed=v), "air.lattice_speed", (1e-6, 0.5)),
         (lambda v: ComputedAir(FAR, NEAR, v), "air.cells", (10**6, 10**12)),
     ],
 )

@@ -17,11 +17,10 @@ ROWS = [[0.0, 5.0], [2.0, -1.0], [3.0, 4.0], [3.0, 6.0]]
 
 
 def test_keys_are_met_and_held_beyond():
-    for interpolation in ("smooth", "linear"):
-        for time, row in zip(TIMES, ROWS, strict=True):
-            assert interpolate_keys(TIMES, ROWS, time, interpolation) == pytest.approx(row)
-        assert interpolate_keys(TIMES, ROWS, -3.0, interpolation) == ROWS[0]
-        assert interpolate_keys(TIMES, ROWS, 9.0, interpolation) == ROWS[-1]
+    for time, row in zip(TIMES, ROWS, strict=True):
+        assert interpolate_keys(TIMES, ROWS, time) == pytest.approx(row)
+    assert interpolate_keys(TIMES, ROWS, -3.0) == ROWS[0]
+    assert interpolate_keys(TIMES, ROWS, 9.0) == ROWS[-1]
 
 
 def test_smooth_values_stay_between_their_keys_and_have_no_kink():
@@ -42,8 +41,6 @@ def test_smooth_values_stay_between_their_keys_and_have_no_kink():
             assert left == pytest.approx(right, abs=2e-3)
     rising = [interpolate_keys(TIMES, ROWS, 1.0 + x)[0] for x in (-h, h)]
     assert (rising[1] - rising[0]) / (2 * h) > 1.0  # no stop at a key that is passed
-    linear = [interpolate_keys(TIMES, ROWS, 1.0 + x, "linear")[1] for x in (-h, 0.0, h)]
-    assert (linear[1] - linear[0]) * (linear[2] - linear[1]) < 0
 
 
 def test_two_smooth_keys_are_a_smoothstep():
@@ -72,7 +69,7 @@ def test_angles_are_those_of_the_orbit():
 
 def test_eyes_look_at_their_targets():
     keys = [CameraKey(0.0, eye=[0.0, -3.0, 0.0]), CameraKey(1.0, eye=[2.0, -3.0, 1.0], target=[0.0, 0.0, 1.0])]
-    path = LookAtCamera(keys=keys, interpolation="linear", width=32, height=18)
+    path = LookAtCamera(keys=keys, width=32, height=18)
     found = path(0, 0.5, CENTER, UP, 1.0)
     expected = look_at_camera([1.0, -3.0, 0.5], [0.0, 0.0, 0.5], UP, 40.0, 32, 18, dtype=torch.float64)
     torch.testing.assert_close(found.world_to_camera, expected.world_to_camera)

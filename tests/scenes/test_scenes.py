@@ -10,6 +10,7 @@ from torch.testing import assert_close
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.scenes import DemoScene, FlagScene
 from gaussian_swaying.scenes.alocasia import alocasia
+from gaussian_swaying.scenes.demo import MADE
 from gaussian_swaying.scenes.ficus import ficus
 from gaussian_swaying.scenes.leaves import leafy_branch
 from gaussian_swaying.scenes.patches import baked
@@ -52,7 +53,7 @@ def test_the_same_arguments_give_the_same_splat(kind):
     for name in FIELDS:
         assert torch.equal(getattr(one, name), getattr(two, name)), name
     if kind != "telephone":
-        other = DemoScene(kind, 0.05, seed=1).generate()
+        other = MADE[kind](spacing=0.05, seed=1)
         assert len(one) != len(other) or not torch.equal(one.means, other.means)
 
 
@@ -178,7 +179,7 @@ def test_ups_are_up():
         ("alocasia", "size", -1.0),
         ("vase", "count", 0),
         ("telephone", "count", 0),
-        ("telephone", "seed", 1),
+        ("telephone", "size", 1.0),
         ("sand", "size", 1.0),
         ("bear", "kind", "bear"),
     ],

@@ -67,7 +67,6 @@ def test_the_same_arguments_give_the_same_splat():
         ({"size": 0.0}, "generator.size"),
         ({"spacing": 0.3}, "quarter of the size"),
         ({"overlap": -1.0}, "generator.overlap"),
-        ({"jitter": 2.0}, "generator.jitter"),
     ],
 )
 def test_bad_settings_are_refused(settings, words):

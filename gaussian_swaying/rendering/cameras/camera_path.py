@@ -22,7 +22,7 @@ from gaussian_swaying.rendering.cameras.camera import (
     look_at_camera,
     orbit_camera,
 )
-from gaussian_swaying.rendering.cameras.keyframes import CameraKey, Interpolation, KeyedCamera
+from gaussian_swaying.rendering.cameras.keyframes import CameraKey, KeyedCamera
 
 
 class CameraPath(Fixed, ABC):
@@ -158,9 +158,8 @@ class LookAtCamera(PinholePath):
     Args:
         eye: Position [scene units], 3 numbers.
         target: Point at the image centre [scene units], 3 numbers; the object's centre when None.
-        keys: Instead, times and positions, sorted by time.
-        interpolation: ``smooth`` (continuous speed, at rest before the first key and after the last, no overshoot) or
-            ``linear``.
+        keys: Instead, times and positions, sorted by time. The speed between them is continuous and does not overshoot;
+            the camera is at rest before the first key and after the last.
         up: Direction seen upwards in the image where an ``eye`` is given, 3 numbers; that of the scene when None.
         width: Image width [pixels].
         height: Image height [pixels].
@@ -183,7 +182,6 @@ class LookAtCamera(PinholePath):
     target: Sequence[float] | None = None
     _: KW_ONLY
     keys: list[CameraKey] | None = None
-    interpolation: Interpolation = "smooth"
     up: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
@@ -195,7 +193,7 @@ class LookAtCamera(PinholePath):
         self.up = None if self.up is None else check_direction("up", self.up)
         eye, target = (None if place is None else list(place) for place in (self.eye, self.target))
         keys = [CameraKey(0.0, eye, target=target)] if self.keys is None else self.keys
-        self._path = KeyedCamera(keys, self.fov_y, self.interpolation)
+        self._path = KeyedCamera(keys, self.fov_y)
 
     @property
     def still(self) -> bool:  # type: ignore[override]

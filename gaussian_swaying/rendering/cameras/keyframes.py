@@ -6,21 +6,17 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any
 
 from gaussian_swaying._checks import check_positive, check_vector
 from gaussian_swaying._fixed import fixed
 from gaussian_swaying.rendering.cameras.camera import check_elevation, check_fov
 
-Interpolation = Literal["smooth", "linear"]
 
-
-def interpolate_keys(
-    times: Sequence[float], values: Sequence[Sequence[float]], time: float, interpolation: str = "smooth"
-) -> list[float]:
+def interpolate_keys(times: Sequence[float], values: Sequence[Sequence[float]], time: float) -> list[float]:
     """Values between keys; constant before the first and after the last.
 
-    ``smooth`` is the monotone cubic of Fritsch & Butland 1984 ("A method for constructing local monotone piecewise
+    This is the monotone cubic of Fritsch & Butland 1984 ("A method for constructing local monotone piecewise
     cubic interpolants") with slope zero at both ends. Each number and its rate are continuous at all times, and between
     two keys no number leaves the range of the two.
 
@@ -28,7 +24,6 @@ def interpolate_keys(
         times: Increasing times [s], K of them.
         values: Numbers at each of them, K rows of D.
         time: Time [s].
-        interpolation: ``smooth`` or ``linear``.
 
     Returns:
         D numbers.
@@ -46,9 +41,6 @@ def interpolate_keys(
     s = (time - times[k]) / span
     between = []
     for d, (start, end) in enumerate(zip(values[k], values[k + 1], strict=True)):
-        if interpolation == "linear":
-            between.append(start + s * (end - start))
-            continue
         before, after = (_slope(times, [row[d] for row in values], at) for at in (k, k + 1))
         ease = s * s * (3 - 2 * s)
         between.append(start + ease * (end - start) + span * s * (1 - s) * ((1 - s) * before - s * after))
@@ -97,16 +89,14 @@ class KeyedCamera:
     Args:
         keys: Times and positions, sorted by time.
         fov_y: Field of view of keys that give none [degrees].
-        interpolation: As in :func:`interpolate_keys`.
 
     Attributes:
         orbits: Whether places are azimuth, elevation and radius.
     """
 
-    def __init__(self, keys: Sequence[CameraKey], fov_y: float, interpolation: Interpolation) -> None:
+    def __init__(self, keys: Sequence[CameraKey], fov_y: float) -> None:
         if not keys:
             raise ValueError("Expected `keys` to hold at least one key with a time and a position.")
-        self.interpolation = interpolation
         self.times = [check_vector("keys.time", [key.time], 1)[0] for key in keys]
         if any(a >= b for a, b in pairwise(self.times)):
             raise ValueError(f"Expected the times of `keys` to increase, but got {self.times}.")
@@ -138,8 +128,7 @@ class KeyedCamera:
         """Place, target and field of view [degrees] at a time [s]; ``middle`` is the target of keys without one."""
         targets = [middle if target is None else target for target in self.targets]
         place, target, (fov,) = (
-            interpolate_keys(self.times, values, time, self.interpolation)
-            for values in (self.places, targets, self.fovs)
+            interpolate_keys(self.times, values, time) for values in (self.places, targets, self.fovs)
         )
         return place, target, fov
 
