@@ -174,7 +174,7 @@ class PinnedRegion(ParticleBoundary):
         if front is not None:
             ends = torch.tensor([check_vector("front", place) for place in front], dtype=torch.float64)
             if len(front) not in (1, 2) or not bool((ends[-1] - ends[:-1].sum(0)).any()):
-                raise ValueError(f"Expected `front` to be a direction, or two places apart, but got {front}.")
+                raise ValueError(f"Expected `front` to be a direction, or two places apart, but got {ends.tolist()}.")
             if not math.isfinite(self.end):
                 raise ValueError(f"Expected `end` of a PinnedRegion with a `front` to be a finite time, but got {end}.")
         self.register_buffer("front", ends)
