@@ -6,8 +6,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from shared import SMALL, refused, words
-from torch import Tensor, nn
+from shared import SMALL, refused, small_network, words
 
 from gaussian_swaying.cli.evaluate import main
 from gaussian_swaying.cli.simulate import main as simulate
@@ -16,11 +15,6 @@ from gaussian_swaying.recording.trajectory import load_trajectory
 pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
 SIDE = 1.2
 CENTRE = torch.tensor([0.6, 0.0, 0.4])  # of the flag's box, where the simulation has its origin
-
-
-class Means(nn.Module):
-    def forward(self, x: Tensor) -> Tensor:
-        return x.mean(dim=[3, 4]).flatten(1)
 
 
 def _simulate(folder, gravity):
@@ -66,8 +60,7 @@ def test_a_run_beside_a_reference(folders, tmp_path, capsys):
 
 def test_options(folders, tmp_path):
     run, reference = folders
-    network = tmp_path / "network.pt"
-    torch.jit.script(Means()).save(str(network))
+    network = small_network(tmp_path / "network.pt")
     command = [str(run), str(reference), "--output", str(tmp_path / "out"), "--device", "cpu", "--no-video"]
     command += ["--reference-offset", "1", "--frames", "3", "--side", "2", "--points", "50", "--seed", "7"]
     command += ["--i3d", str(network), "--clip-length", "2", "--clip-stride", "1", "--resize", "8"]

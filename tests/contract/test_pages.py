@@ -1,16 +1,13 @@
 """Pages that a user can put on any website, in a browser: the film of a run, and a simulation."""
 
-import json
-
 import numpy as np
 import pytest
+from shared import PIN, words
 
 from gaussian_swaying.cli.main import main
 from tests.browsers import asked_of_a_network, listened, picture_of, until
 
-POLE = {"class_path": "Box", "init_args": {"min": [None] * 3, "max": [0.11, None, None]}}
-PIN = {"class_path": "PinnedRegion", "init_args": {"region": POLE}}
-SMALL = ["--scene.generator.init_args.spacing=0.05", "--solver.dx=0.1", f"--solver.boundaries={json.dumps([PIN])}"]
+SMALL = words({"scene.generator.init_args.spacing": 0.05, "solver.dx": 0.1, "solver.boundaries": [PIN]})
 GRAPHICS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 

@@ -7,8 +7,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from shared import value_error
-from torch import Tensor, nn
+from shared import small_network, value_error
 
 from gaussian_swaying.evaluation.compare import compare_run, evaluate, table
 from gaussian_swaying.geometry.frame import SimFrame
@@ -19,16 +18,9 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
 POINTS = 2000
 
 
-class Means(nn.Module):
-    def forward(self, x: Tensor) -> Tensor:
-        return x.mean(dim=[3, 4]).flatten(1)
-
-
 @pytest.fixture
 def network(tmp_path):
-    path = tmp_path / "network.pt"
-    torch.jit.script(Means()).save(str(path))
-    return FrechetVideoDistance(path, clip_length=2, resize=8)
+    return FrechetVideoDistance(small_network(tmp_path / "network.pt"), clip_length=2, resize=8)
 
 
 @pytest.fixture
