@@ -13,6 +13,7 @@ import torch
 
 from gaussian_swaying import _program as program
 from gaussian_swaying._checks import check_positive
+from gaussian_swaying._files import write_text
 from gaussian_swaying.cli.errors import run_command  # first, as it sets up threads
 from gaussian_swaying.gaussians.formats import (
     FORMATS,
@@ -23,10 +24,11 @@ from gaussian_swaying.gaussians.formats import (
     numbered,
     read_gaussians,
 )
+from gaussian_swaying.gaussians.ply import check_folder
 from gaussian_swaying.gaussians.spz import VERSIONS
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.simulation.simulation import RecordedRun
-from gaussian_swaying.viewer.film.page import write_film
+from gaussian_swaying.viewer.film.page import PAGE, write_film
 
 
 def build_options() -> argparse.ArgumentParser:
@@ -54,6 +56,11 @@ def build_options() -> argparse.ArgumentParser:
         action="store_true",
         help="Write the scene `source` as a page that simulates it in a browser; `export --live-web --help` has its "
         "options.",
+    )
+    parser.add_argument(
+        "--player",
+        action="store_true",
+        help="Write sway.js into the folder `source`: the module that plays .sway files with three.js and Spark.",
     )
     parser.add_argument(
         "--apart",
@@ -99,6 +106,12 @@ def main(arguments: list[str] | None = None) -> int:
 
 def export(options: argparse.Namespace) -> None:
     """Convert, and report the file."""
+    if options.player:
+        folder = Path(options.source)
+        check_folder(folder / "sway.js")
+        write_text(folder / "sway.js", (PAGE / "sway.min.js").read_text(encoding="utf-8"))
+        print(f"wrote {folder / 'sway.js'}")
+        return None
     given = {"--up": options.up, "--metres-per-unit": options.metres_per_unit}
     if options.web or Path(options.target or "").suffix == ".sway":
         refuse("a film", given | {"--spz-version": options.spz_version, "--apart": options.apart or None})

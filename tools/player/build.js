@@ -1,11 +1,11 @@
-// Writes film.min.js of the package, the programs of films and of both live pages with what they use of Spark and three.js, and
-// worker.min.js, the solver in a browser.
+// Writes film.min.js of the package, the programs of films and of both live pages with what they use of Spark and three.js,
+// sway.min.js for scenes of others, and worker.min.js, the solver in a browser.
 import asc from "assemblyscript/asc";
 import { build } from "esbuild";
 import { createHash } from "node:crypto";
 import { readFile } from "node:fs/promises";
 
-const OWN = "brush.js build.js film.glsl.js film.js gaussians.js live.js main.js playback.js sorter.js view.js".split(" ");
+const OWN = "brush.js build.js bundle.js film.glsl.js film.js gaussians.js live.js main.js playback.js sorter.js view.js".split(" ");
 OWN.push(..."dial.js page.js settings.js".split(" ").map((name) => `live_web/${name}`));
 const SOLVER = "aero.js block.js body.js contact.js lanes.js laws.js matrices.js modal.js points.ts solver.js substep.wgsl touch.wgsl webgpu.js wind.js worker.js"
   .split(" ")
@@ -47,6 +47,18 @@ await build({
   legalComments: "eof", // the full licences are in LICENSES.txt, which stands in each film
   logLevel: "info",
   plugins: [{ name: "cut-spark", setup: (made) => made.onLoad({ filter: /spark\.module\.js$/ }, cutSpark) }],
+});
+
+// sway.js, with three.js and Spark as its user has them.
+await build({
+  entryPoints: ["sway.js"],
+  outfile: "../../gaussian_swaying/viewer/film/page/sway.min.js",
+  bundle: true,
+  minify: true,
+  format: "esm",
+  external: ["three", "@sparkjsdev/spark"],
+  banner: await banner(["build.js", "bundle.js", "film.glsl.js", "gaussians.js", "sorter.js", "sway.js"]),
+  logLevel: "info",
 });
 
 // points.ts compiled to WebAssembly: points.wasm, and points.fused.wasm, which multiplies and adds in one instruction.

@@ -1,45 +1,7 @@
 // A film of Gaussians: splats once, the displacement of grid nodes per frame. See docs/web.md.
-import { reader, writeNodes } from "./gaussians.js";
+import { Frames } from "./bundle.js";
+import { reader } from "./gaussians.js";
 import { View } from "./view.js";
-
-// ---- the parts of the file, see gaussian_swaying/viewer/film/page.py
-
-// The few nodes of each frame that swing far: index and displacement.
-function readFar(bytes, frames) {
-  const counts = reader(bytes.subarray(0, 4 * frames))(Uint32Array, frames);
-  const rows = reader(bytes.subarray(4 * frames))(Int32Array, (bytes.length - 4 * frames) / 4);
-  const values = new Float32Array(rows.buffer);
-  let at = 0;
-  return Array.from(counts, (count) => {
-    const begin = at;
-    at += 4 * count;
-    return { rows: rows.subarray(begin, at), values: values.subarray(begin, at) };
-  });
-}
-
-// The displacements of a film, which come in parts of some frames.
-class Frames {
-  constructor({ frames, nodes }) {
-    this.row = 3 * nodes;
-    this.near = new Int16Array(frames * this.row);
-    this.far = [];
-  }
-
-  get loaded() {
-    return this.far.length;
-  }
-
-  add(bytes, count) {
-    const begin = this.loaded * this.row;
-    const end = begin + count * this.row;
-    const size = 2 * (end - begin);
-    const folded = reader(bytes.subarray(0, size))(Uint16Array, end - begin); // differences to the frame before, the sign in the last bit
-    folded.forEach((value, k) => (this.near[begin + k] = ((value >> 1) ^ -(value & 1)) + (this.near[begin + k - this.row] ?? 0)));
-    this.far.push(...readFar(bytes.subarray(size), count));
-  }
-}
-
-// ---- the page
 
 // `read(name)` gives a part of the file once it is there; `tell(sentence)` is called if the file ends too early.
 export async function play(read, tell) {
@@ -60,9 +22,7 @@ export async function play(read, tell) {
 
   function show(frame) {
     if (frame === state.frame) return;
-    const { row } = frames;
-    const from = frames.near.subarray(frame * row, (frame + 1) * row);
-    drawing.move((data) => writeNodes(data, from, frames.far[frame], head.step));
+    drawing.move((data) => frames.write(data, frame));
     state.frame = frame;
     slider.value = String(frame);
     const seconds = (count) => (count * head.frame_dt).toFixed(2);

@@ -132,37 +132,9 @@ class Layer {
   }
 }
 
-// ---- the canvas
-
-export class Drawing {
-  // `wake(pictures)` is called when so many pictures have to be drawn.
-  constructor(canvas, wake) {
-    this.wake = wake;
-    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false });
-    this.renderer.debug.checkShaderErrors = false; // asking for them waits
-    this.scene = new THREE.Scene();
-    this.spark = null;
-  }
-
-  // Draw other Gaussians from now on, once they are added. Throws an Error if they are too many for this browser.
-  show(head, stencils) {
-    const height = Math.ceil(Math.max(head.count, head.nodes, stencils.length / 3) / WIDTH);
-    if (height > this.renderer.capabilities.maxTextureSize)
-      throw new Error("the scene is too large for the textures of this browser");
-    this.clear();
-    const { renderer } = this;
-    this.spark = new SparkRenderer({
-      renderer,
-      accumExtSplats: true,
-      covSplats: true,
-      preBlurAmount: 0.3, // as our renderers: added to the projected covariance, without changing the opacity
-      blurAmount: 0.0,
-      maxStdDev: 3.0,
-      sortRadial: false,
-      enableLod: false,
-      onDirty: () => this.wake(1),
-    });
-    this.spark.sortWorker = makeSorter();
+// All Gaussians of a film or a scene, in units of the object's size with z up; `group` goes into a scene that Spark draws.
+export class Splat {
+  constructor(head, stencils) {
     this.count = head.count;
     this.moved = floats(head.nodes);
     this.rows = rowsTexture(stencils);
@@ -180,14 +152,14 @@ export class Drawing {
       moving: new Layer("moving", head.moving, this.inputs),
       still: new Layer("still", head.count - head.moving, {}),
     };
+    this.group = new THREE.Group();
+    this.group.add(this.layers.moving.group, this.layers.still.group);
     this.light(head);
-    this.scene.add(this.spark, this.layers.moving.group, this.layers.still.group);
   }
 
   // Add the next Gaussians that are "moving", or "still".
   add(kind, bytes) {
     if (bytes.length > 0) this.layers[kind].add(bytes);
-    this.wake(3);
   }
 
   // From now on they follow the nodes; until then all are at rest, so that the first picture needs no long shader.
@@ -196,34 +168,11 @@ export class Drawing {
     this.changed();
   }
 
-  // Compute and sort what has come, while the shaders of the picture are compiled; the next picture shows it.
-  begin(camera) {
-    camera.updateMatrixWorld();
-    this.spark.update({ scene: this.scene, camera });
-    this.render(camera);
-  }
-
-  // Leave out the faint rims of Gaussians, which cost most, or not.
-  rough(on) {
-    this.spark.maxStdDev = on ? Math.sqrt(6) : 3;
-  }
-
-  // Give up the Gaussians that are drawn.
-  clear() {
-    if (this.spark === null) return;
-    this.scene.clear();
-    this.spark.readbackDepth = () => new Promise(() => {}); // a sort that has begun, or waits for its turn, ends here
-    this.spark.dispose();
-    for (const made of [this.rows, this.moved, this.layers.moving, this.layers.still]) made.dispose();
-    this.spark = null;
-  }
-
-  // Light and background, as in the head.
-  light({ shader, background }) {
+  // Light, as in the head.
+  light({ shader }) {
     const { light, two_sided, ambient, relative } = shader ?? { light: [0, 0, 1] };
     this.inputs.light.value.set(...light);
     this.inputs.kind.value.set(...[two_sided, ambient, relative, shader !== null].map((value) => Number(value ?? 0)));
-    this.renderer.setClearColor(new THREE.Color().setRGB(...background, THREE.SRGBColorSpace));
     this.changed();
   }
 
@@ -247,7 +196,97 @@ export class Drawing {
 
   changed() {
     this.layers.moving.generator.updateVersion();
-    this.wake(3); // Spark draws what it computed for the picture before
+  }
+
+  dispose() {
+    for (const made of [this.rows, this.moved, this.layers.moving, this.layers.still]) made.dispose();
+  }
+}
+
+// ---- the canvas
+
+export class Drawing {
+  // `wake(pictures)` is called when so many pictures have to be drawn.
+  constructor(canvas, wake) {
+    this.wake = wake;
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false });
+    this.renderer.debug.checkShaderErrors = false; // asking for them waits
+    this.scene = new THREE.Scene();
+    this.spark = this.splat = null;
+  }
+
+  // Draw other Gaussians from now on, once they are added. Throws an Error if they are too many for this browser.
+  show(head, stencils) {
+    const height = Math.ceil(Math.max(head.count, head.nodes, stencils.length / 3) / WIDTH);
+    if (height > this.renderer.capabilities.maxTextureSize)
+      throw new Error("the scene is too large for the textures of this browser");
+    this.clear();
+    const { renderer } = this;
+    this.spark = new SparkRenderer({
+      renderer,
+      accumExtSplats: true,
+      covSplats: true,
+      preBlurAmount: 0.3, // as our renderers: added to the projected covariance, without changing the opacity
+      blurAmount: 0.0,
+      maxStdDev: 3.0,
+      sortRadial: false,
+      enableLod: false,
+      onDirty: () => this.wake(1),
+    });
+    this.spark.sortWorker = makeSorter();
+    this.splat = new Splat(head, stencils);
+    this.scene.add(this.spark, this.splat.group);
+    this.light(head);
+  }
+
+  // As those of Splat; Spark draws what it computed for the picture before.
+  add(kind, bytes) {
+    this.splat.add(kind, bytes);
+    this.wake(3);
+  }
+
+  follow() {
+    this.splat.follow();
+    this.wake(3);
+  }
+
+  move(fill) {
+    this.splat.move(fill);
+    this.wake(3);
+  }
+
+  recolour(places, colours) {
+    this.splat.recolour(places, colours);
+    this.wake(3);
+  }
+
+  // Light and background, as in the head.
+  light(head) {
+    this.splat.light(head);
+    this.renderer.setClearColor(new THREE.Color().setRGB(...head.background, THREE.SRGBColorSpace));
+    this.wake(3);
+  }
+
+  // Compute and sort what has come, while the shaders of the picture are compiled; the next picture shows it.
+  begin(camera) {
+    camera.updateMatrixWorld();
+    this.spark.update({ scene: this.scene, camera });
+    this.render(camera);
+  }
+
+  // Leave out the faint rims of Gaussians, which cost most, or not.
+  rough(on) {
+    this.spark.maxStdDev = on ? Math.sqrt(6) : 3;
+  }
+
+  // Give up the Gaussians that are drawn.
+  clear() {
+    if (this.spark === null) return;
+    this.scene.clear();
+    this.spark.readbackDepth = () => new Promise(() => {}); // a sort that has begun, or waits for its turn, ends here
+    this.spark.dispose();
+    this.splat.dispose();
+    this.spark = null;
   }
 
   get ready() {
@@ -263,32 +302,36 @@ export class Drawing {
     this.renderer.render(this.scene, camera);
   }
 
-  // Centres of the Gaussians as the GPU computed them for the picture, those that move first, in units of the object's size.
+  // See positionsOf.
   positions() {
-    const { renderer, count } = this;
-    const gl = renderer.getContext();
-    const { target, mapping } = this.spark.display;
-    const layer = target.width * target.height;
-    const made = renderer.properties.get(target.textures[0]).__webglTexture;
-    const all = new Float32Array(3 * layer * target.depth);
-    const buffer = gl.createFramebuffer();
-    gl.bindFramebuffer(gl.READ_FRAMEBUFFER, buffer);
-    for (let k = 0; k < target.depth; k++) {
-      gl.framebufferTextureLayer(gl.READ_FRAMEBUFFER, gl.COLOR_ATTACHMENT0, made, 0, k);
-      const words = new Uint32Array(4 * layer);
-      gl.readPixels(0, 0, target.width, target.height, gl.RGBA_INTEGER, gl.UNSIGNED_INT, words);
-      const values = new Float32Array(words.buffer);
-      for (let i = 0; i < layer; i++) all.set(values.subarray(4 * i, 4 * i + 3), 3 * (k * layer + i));
-    }
-    gl.bindFramebuffer(gl.READ_FRAMEBUFFER, null);
-    gl.deleteFramebuffer(buffer);
-    renderer.resetState();
-    const out = new Float32Array(3 * count);
-    let at = 0;
-    for (const { base, count: own } of mapping) {
-      out.set(all.subarray(3 * base, 3 * (base + own)), at);
-      at += 3 * own;
-    }
-    return out;
+    return positionsOf(this.renderer, this.spark, this.splat.count);
   }
+}
+
+// Centres of the Gaussians as the GPU computed them for the picture, those that move first, in units of the object's size.
+export function positionsOf(renderer, spark, count) {
+  const gl = renderer.getContext();
+  const { target, mapping } = spark.display;
+  const layer = target.width * target.height;
+  const made = renderer.properties.get(target.textures[0]).__webglTexture;
+  const all = new Float32Array(3 * layer * target.depth);
+  const buffer = gl.createFramebuffer();
+  gl.bindFramebuffer(gl.READ_FRAMEBUFFER, buffer);
+  for (let k = 0; k < target.depth; k++) {
+    gl.framebufferTextureLayer(gl.READ_FRAMEBUFFER, gl.COLOR_ATTACHMENT0, made, 0, k);
+    const words = new Uint32Array(4 * layer);
+    gl.readPixels(0, 0, target.width, target.height, gl.RGBA_INTEGER, gl.UNSIGNED_INT, words);
+    const values = new Float32Array(words.buffer);
+    for (let i = 0; i < layer; i++) all.set(values.subarray(4 * i, 4 * i + 3), 3 * (k * layer + i));
+  }
+  gl.bindFramebuffer(gl.READ_FRAMEBUFFER, null);
+  gl.deleteFramebuffer(buffer);
+  renderer.resetState();
+  const out = new Float32Array(3 * count);
+  let at = 0;
+  for (const { base, count: own } of mapping) {
+    out.set(all.subarray(3 * base, 3 * (base + own)), at);
+    at += 3 * own;
+  }
+  return out;
 }

@@ -61,7 +61,7 @@ export class View {
     controls.addEventListener("change", () => this.wake(3));
     controls.update();
     Object.assign(this, { camera, controls });
-    this.wanted = reach(head, drawing.layers.moving) + 0.3 / camera.position.distanceTo(controls.target); // and room to swing
+    this.wanted = reach(head, drawing.splat.layers.moving) + 0.3 / camera.position.distanceTo(controls.target); // and room to swing
     window.addEventListener("resize", () => this.resize());
     this.resize();
   }

@@ -1,14 +1,16 @@
 """A film in a real browser."""
 
 import base64
+import re
 
 import numpy as np
 import pytest
 from browsers import asked_of_a_network, listened, picture_of, until
 from shared import double, longest, peak
 
+from gaussian_swaying.cli.export import main
 from gaussian_swaying.viewer.film import page as film_page
-from gaussian_swaying.viewer.film.page import write_film
+from gaussian_swaying.viewer.film.page import PAGE, read_bundle, write_film
 from gaussian_swaying.viewer.film.recorded import order_of
 
 SHOWN = "!!window.film || !document.getElementById('message').textContent.startsWith('Loading')"
@@ -89,6 +91,67 @@ def test_the_film_is_the_run(show, film, run, make_flag, stretched):
     until(lambda: page.evaluate("film.drawn()") >= before + 5)
     page.evaluate("film.pause()")
     assert page.told == asked_of_a_network(page) == []
+
+
+@pytest.fixture
+def own_scene(browser, run, tmp_path, request):
+    """Opens the page of a user with three.js, Spark and sway.js, which a server has beside a film."""
+    write_film(run, tmp_path / "flag.sway")
+    assert main(["--player", str(tmp_path)]) == 0
+    example, program = (request.config.rootpath / name for name in ("examples/web/three.html", "tools/player/main.js"))
+    names = {
+        "three": re.search(r"const three = \{(.*)\}", program.read_text(encoding="utf-8"))[1],
+        "spark": "dyno, SplatGenerator",
+    }
+    sorted_by_script = (  # as the engine here has no WebAssembly
+        "export class SparkRenderer extends window.engine.spark.SparkRenderer {"
+        " constructor(options) { super(options); this.sortWorker = window.engine.makeSorter(); } }"
+    )
+    more = {"spark": sorted_by_script}
+    page = listened(browser.new_page(viewport={"width": 320, "height": 180}))
+
+    def serve(route):
+        path = route.request.url.removeprefix("http://own.test/")
+        engine = next((name for name in names if path.startswith("http") and name in path), None)
+        if engine is not None:
+            text = f"export const {{ {names[engine]} }} = window.engine.{engine};" + more.get(engine, "")
+            route.fulfill(body=text, content_type="text/javascript", headers={"Access-Control-Allow-Origin": "*"})
+        elif path == "":
+            route.fulfill(body=example.read_bytes(), content_type="text/html")
+        elif (tmp_path / path).is_file():
+            kind = "text/javascript" if path.endswith(".js") else "application/octet-stream"
+            route.fulfill(body=(tmp_path / path).read_bytes(), content_type=kind)
+        else:
+            route.fulfill(status=404)
+
+    page.add_init_script(path=PAGE / "film.min.js")
+    page.route("**/*", serve)
+    page.goto("http://own.test/")
+    yield page
+    page.close()
+
+
+def test_a_scene_of_ones_own_plays_a_bundle(own_scene, tmp_path):
+    """In three.js with Spark, with places as the GPU computed them."""
+    page, film = own_scene, read_bundle(tmp_path / "flag.sway")
+    until(lambda: page.evaluate("window.shown?.splat.duration > 0"))
+    page.evaluate("shown.splat.complete")
+    assert page.evaluate("shown.splat.duration") == pytest.approx(0.24)
+
+    def places():
+        found = page.evaluate("Array.from(engine.positionsOf(shown.renderer, shown.spark, shown.splat.head.count))")
+        return double(found).reshape(-1, 3)
+
+    until(lambda: page.evaluate("shown.spark.activeSplats") > 0)
+    fifth, second = film.moved(5)[0], film.moved(2)[0]
+    page.evaluate("window.stopped = 0.24 + 0.2")
+    until(lambda: longest(places() - fifth) < 1e-4)
+    page.evaluate("window.stopped = 0.24 + 0.08")
+    until(lambda: longest(places() - second) < 1e-4)
+    assert longest(fifth - second) > 0.01
+    assert page.problems == []
+    wrong = page.evaluate("(new shown.splat.constructor('none.sway')).complete.catch(({ message }) => message)")
+    assert wrong == "none.sway cannot be read (404)"
 
 
 def test_gaussians_are_sorted_from_far_to_near(show, film):
