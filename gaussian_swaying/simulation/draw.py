@@ -513,8 +513,8 @@ class View:
     @property
     def depth_range(self) -> tuple[Tensor, Tensor]:
         """Ends of the depth's colour scale [scene units]: one longest side before and behind the object's centre."""
-        center, size = self.painter.center, self.painter.size
-        distance = torch.linalg.vector_norm(self.camera.position.to(center) - center)
+        eye, size = self.camera.position, self.painter.size
+        distance = torch.linalg.vector_norm(eye - self.painter.center.to(eye, non_blocking=True))  # no wait for a GPU
         return distance - size, distance + size
 
     def blend(self, values: Tensor) -> RenderOutput:
