@@ -27,6 +27,7 @@ GONE = {
     "KeyframedCamera": "LookAtCamera with `keys`",
     "TransformsCamera": "CaptureCamera with `view`",
     **{f"{name}Camera.near": "the default, a hundredth of the distance" for name in ("Orbit", "LookAt", "Capture")},
+    "recorder.images": "`recorder.renders`, which may be empty",
     "ComputedAir.lattice_speed": "`speed`",
     **{f"{name}Camera.interpolation": "the default, smooth" for name in ("LookAt", "Capture")},
     "SolidScene.jitter": "the default, 0.3",

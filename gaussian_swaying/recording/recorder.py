@@ -80,14 +80,14 @@ class Recorder:
     :meth:`wait` or :meth:`close` raises the error.
 
     Args:
-        images: Write a PNG per frame.
-        video: Encode the frames; needs ``images``.
+        video: Encode the frames.
         trajectory: Write position (float32, metres, z up) and F (float16) of the simulated particles for each frame.
         checkpoint_every: Write the state for ``--resume`` every ``checkpoint_every`` frames; 0 for never.
         fps: Frames per second of the video; null for real time, 1 / frame_dt.
         loop: Time [s] in which the end of the motion becomes its beginning, so that a film closes; 0 for none. The
             first frames, as many as that takes, are recorded only as that end.
-        renders: Pictures of each frame: ``color``, ``depth``, ``normal``, ``force``, ``wind``, ``vorticity``.
+        renders: Pictures of each frame: ``color``, ``depth``, ``normal``, ``force``, ``wind``, ``vorticity``; none for
+            motion alone.
         nodes: In ``total``, write the displacement (metres, z up; float16, or float32 where it is long) of the nodes
             that the Gaussians follow for each frame, for ``gaussian-swaying export``. Runs of ``updated`` have
             nothing to write.
@@ -95,7 +95,6 @@ class Recorder:
 
     live_as = "recorder"
 
-    images: bool = True
     video: bool = True
     _: KW_ONLY
     trajectory: bool = True
@@ -110,15 +109,13 @@ class Recorder:
             if (value := getattr(self, name)) is not None:
                 check_positive(f"recorder.{name}", value, allow_zero=name != "fps")
         renders = self.renders
-        if not renders or len(set(renders)) < len(renders):
+        if len(set(renders)) < len(renders):
             raise ValueError(
                 f"Expected `recorder.renders` to be a list of different ones of {', '.join(PASSES)}, but got "
                 f"{renders!r}."
             )
         for render in renders:
             check_choice("recorder.renders", render, tuple(PASSES))
-        if self.video and not self.images:
-            raise ValueError("The video is made from the images: set `recorder.images` to true or `video` to false.")
         self._folder: Path | None = None
         self._writer = FrameWriter()
         self._films: dict[str, _Film] = {}  # by the folder of their frames
@@ -126,6 +123,11 @@ class Recorder:
         self._checkpoint_frame: int | None = None
         self._real_time_fps = 25.0
         self._blank: list[tuple[str, int]] = []
+
+    @property
+    def images(self) -> bool:
+        """True if there are pictures."""
+        return bool(self.renders)
 
     def __getstate__(self) -> dict[str, Any]:
         """The settings: a copy has no folder, no open files and nothing that waits to be written."""

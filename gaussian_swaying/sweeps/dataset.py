@@ -106,7 +106,7 @@ def _read_frames(place: Path) -> Tensor:
 
     files = sorted((place / "frames").glob("[0-9]*.png"))
     if not files:
-        _check_recorded(place / "frames" / "00000.png", "frames", "recorder.images: true")
+        _check_recorded(place / "frames" / "00000.png", "frames", "recorder.renders with color")
     pictures = []
     for file in files:
         try:
@@ -179,7 +179,7 @@ def _add_run(tar: tarfile.TarFile, data: SweepDataset, index: int, frames: bool)
             _add(tar, f"{run}.{name}.npy", _npy(item[name].numpy()))
     pictures = sorted((data.folder / RUNS / run / "frames").glob("[0-9]*.png")) if frames else []
     if frames and not pictures:
-        raise ValueError(f"Run {run} has no pictures: leave out `frames`, or sweep with recorder.images: true.")
+        raise ValueError(f"Run {run} has no pictures: leave out `frames`, or sweep with recorder.renders of color.")
     for picture in pictures:
         _add(tar, f"{run}.{picture.name}", picture.read_bytes())
 

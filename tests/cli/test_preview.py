@@ -218,7 +218,7 @@ def test_a_configuration_is_previewed_as_it_is(splat, tmp_path, capsys):
         "min": [None] * 3, "max": [0.1, None, None]}}}}  # fmt: skip
     mine.write_text(yaml.safe_dump({"scene": {"region": {"class_path": "Box", "init_args": {
         "min": [None] * 3, "max": [None, None, 0.5]}}}, "frames": 7, "solver": {"dx": 0.2, "boundaries": [pin]},
-        "wind": {"flow": [1.0, 2.0, 0.0]}, "recorder": {"images": False, "video": False}}))  # fmt: skip
+        "wind": {"flow": [1.0, 2.0, 0.0]}, "recorder": {"renders": []}}))  # fmt: skip
     assert preview(splat, tmp_path / "out", "--config", str(mine)) == 0
     report = capsys.readouterr().out
     data = json.loads((tmp_path / "out/preview.json").read_text())

@@ -44,7 +44,7 @@ def test_frames_are_those_of_a_run(tmp_path):
     """Also with an edit between two frames, and a second time from the same object."""
     edits = [Edit(time=0.08, E=3e4, color=[1.0, 0.0, 0.0]), Edit(time=0.04, density=60.0)]
     simulation = _flag(edits=edits)
-    simulation.run(tmp_path / "run", 5, progress=False, recorder=Recorder(images=False, video=False))
+    simulation.run(tmp_path / "run", 5, progress=False, recorder=Recorder(renders=()))
     for _ in range(2):
         for frame in simulation.frames(5):
             position, F = load_trajectory(tmp_path / "run/trajectory.npz", frame.index)

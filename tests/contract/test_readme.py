@@ -81,8 +81,7 @@ def test_the_faster_flag_holds_to_its_pole_and_ends_without_warnings(tmp_path, c
     warning at 2 is then 1.5 here, and half of that is left as a margin.
     """
     monkeypatch.chdir(ROOT)
-    said, summary = _quick_start(tmp_path / "flag", capsys, "faster", "--frames", "41", "--recorder.images", "false",
-                                 "--recorder.video", "false")  # fmt: skip
+    said, summary = _quick_start(tmp_path / "flag", capsys, "faster", "--frames", "41", "--recorder.renders", "[]")
     assert said == summary["warnings"] == []
     assert summary["particles"] == 24 * 16 + 4  # more where Gaussians are large for the grid
     stretched = summary["extremes"]["stretched"]

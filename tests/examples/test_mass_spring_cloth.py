@@ -131,7 +131,7 @@ def test_a_yaml_names_a_solver_and_a_wind(tmp_path, monkeypatch, capsys):
             "class_path": "mass_spring_cloth.MassSpringCloth",
             "init_args": {"dx": 0.2, "gravity": [0.0, 0.0, 0.0], "boundaries": pins},
         },
-        "recorder": {"images": False, "video": False},
+        "recorder": {"renders": []},
     }
     file, folder = tmp_path / "scene.yaml", tmp_path / "run"
     file.write_text(yaml.safe_dump(config))

@@ -12,7 +12,7 @@ from gaussian_swaying.simulation.simulation import Simulation
 def test_a_mac_computes_on_its_cpu(tmp_path, monkeypatch):
     """Its kernels are there. With no CUDA, torch looks for streams on MPS, which has none."""
     monkeypatch.setattr("torch.backends.mps.is_available", lambda: True)
-    simulation = Simulation(FlagScene(spacing=0.1), device="auto", recorder=Recorder(images=False, video=False))
+    simulation = Simulation(FlagScene(spacing=0.1), device="auto", recorder=Recorder(renders=()))
     assert simulation.device.type == "cpu"
     simulation.run(tmp_path / "run", frames=2)
 

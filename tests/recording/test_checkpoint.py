@@ -20,7 +20,7 @@ from gaussian_swaying.runs.saved import save_whole
 from gaussian_swaying.simulation.body import Scene
 from gaussian_swaying.simulation.simulation import Simulation
 
-QUIET = {"images": False, "video": False}
+QUIET = {"renders": []}
 
 
 def test_what_is_no_checkpoint_changes_nothing(make_simulation, tmp_path):

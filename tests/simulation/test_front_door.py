@@ -198,7 +198,7 @@ def test_what_is_held_has_no_weight_and_what_is_not_falls():
 # ---- what may not go wrong silently
 
 
-QUIET = Recorder(images=False, video=False)
+QUIET = Recorder(renders=())
 
 
 def _record(simulation, folder, frames, resume=False):

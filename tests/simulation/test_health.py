@@ -63,7 +63,7 @@ def test_remedy_grows_with_the_trouble():
 
 def test_a_run_that_folds_says_so_and_keeps_it(make_simulation, tmp_path, capsys):
     simulation = make_simulation(material=Material(E=20.0, density=10.0))
-    summary = simulation.run(tmp_path / "bad", 12, recorder=Recorder(images=False, video=False))
+    summary = simulation.run(tmp_path / "bad", 12, recorder=Recorder(renders=()))
     assert summary["stretch_max"] > 2
     said = capsys.readouterr().err
     for sentence in summary["warnings"]:
@@ -74,7 +74,7 @@ def test_a_run_that_folds_says_so_and_keeps_it(make_simulation, tmp_path, capsys
     assert summary["extremes"]["moved"]["value"] == worst["displacement_max"]
     assert json.loads((tmp_path / "bad/summary.json").read_text())["warnings"] == summary["warnings"]
     still = make_simulation(material=Material(E=1e5, density=30.0))
-    good = still.run(tmp_path / "good", 3, recorder=Recorder(images=False, video=False))
+    good = still.run(tmp_path / "good", 3, recorder=Recorder(renders=()))
     (coarse,) = good["warnings"]  # of a scene of five cells
     assert "5.5 cells of `solver.dx`" in coarse
     assert capsys.readouterr().err.count("warning") == 1

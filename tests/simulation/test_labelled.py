@@ -145,7 +145,7 @@ scene: {{generator: {{class_path: FlagScene, init_args: {{spacing: 0.04}}}}, par
 solver: {{dx: 0.1}}
 wind: {{flow: [2.0, 3.0, 0.0]}}
 device: cpu
-recorder: {{images: false, video: false}}
+recorder: {{renders: []}}
 """
     )
     run = tmp_path / "run"

@@ -43,7 +43,7 @@ def recorded(request, tmp_path_factory):
         "solver": {"formulation": request.param, "dx": 0.2},
         "wind": {"flow": [6.0, 3.0, 0.0]},
         "edits": [{"time": 0.06, "color": [0.0, 1.0, 0.0]}],
-        "recorder": {"images": False, "video": False},
+        "recorder": {"renders": []},
         "frames": FRAMES,
     }
     settings["scene"]["region"] = _box(low=(None, 0.31, None))

@@ -132,7 +132,11 @@ def test_bad_names_and_renders(make_cloud, make_simulation):
     )
     with value_error(r"lies inside the object.*`cameras\.near\.init_args\.radius`"):
         inside.painter.check_camera(0)
-    for renders, word in ((["colour"], "recorder.renders"), ([], "list of different ones"), ("color", "list of texts")):
+    for renders, word in (
+        (["colour"], "recorder.renders"),
+        (["color"] * 2, "list of different ones"),
+        ("color", "list of texts"),
+    ):
         with pytest.raises((TypeError, ValueError), match=word):
             Recorder(renders=renders)
 

@@ -89,7 +89,7 @@ def test_a_cost_is_that_of_its_run(make_simulation):
     assert cost.substeps >= simulation.solver.substeps(simulation.start(), 0.04) > 1
     assert cost.particles == 96
     assert cost.total_seconds > cost.simulation_seconds > 0
-    simulation.recorder = Recorder(images=False, video=False)
+    simulation.recorder = Recorder(renders=())
     assert estimate_cost(simulation, 2).picture_seconds is None
 
 

@@ -70,7 +70,7 @@ def test_text_and_vectors_on_axes(undisturbed, tmp_path):
 
 def test_what_was_not_recorded_is_told(undisturbed, tmp_path):
     folder = _small_copy(undisturbed, tmp_path / "some")
-    for wanted, setting in (("frames", "images"), ("positions", "trajectory"), ("nodes", "nodes")):
+    for wanted, setting in (("frames", "renders"), ("positions", "trajectory"), ("nodes", "nodes")):
         data = SweepDataset(folder, **{"frames": False, wanted: True})
         with value_error(f"leave out `{wanted}`, or sweep with recorder.{setting}"):
             data[0]

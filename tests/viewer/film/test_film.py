@@ -70,7 +70,7 @@ def test_centres_and_covariances_are_those_of_the_run(make_flag, run, tmp_path, 
 @pytest.mark.parametrize("points", ["grid", "gaussian"])
 def test_parts_with_nodes_of_their_own(make_flag, flags, tmp_path, points):
     """Two flags closer than a cell, in one cell each with a stencil of its own."""
-    make = lambda: make_flag(scene=flags | {"points": points}, recorder={"images": False})  # noqa: E731
+    make = lambda: make_flag(scene=flags | {"points": points}, recorder={"renders": []})  # noqa: E731
     make().run(tmp_path / "run", 4, progress=False)
     simulation, film = make(), read_film(tmp_path / "run")
     cells = np.unique(np.floor(film.place - 0.5), axis=0)
@@ -321,7 +321,7 @@ def test_a_splat_that_moved_or_changed_is_refused(make_flag, tmp_path, capsys):
     splat, folder = tmp_path / "flag.ply", tmp_path / "run"
     cloud = FlagScene(spacing=0.1).generate()
     write_ply(splat, cloud)
-    make_flag(scene={"generator": None, "ply": str(splat)}, recorder={"images": False}).run(folder, 2, progress=False)
+    make_flag(scene={"generator": None, "ply": str(splat)}, recorder={"renders": []}).run(folder, 2, progress=False)
     assert main(["--web", str(folder)]) == 0
     cloud.means[0] += 0.001
     write_ply(splat, cloud)
