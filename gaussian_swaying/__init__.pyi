@@ -9,12 +9,9 @@ from .gaussians.formats import export_cloud as export_cloud
 from .gaussians.formats import read_gaussians as read_gaussians
 from .gaussians.model import GaussianSurfaceModel as GaussianSurfaceModel
 from .gaussians.ply import write_ply as write_ply
-from .geometry.frame import SimFrame as SimFrame
 from .geometry.regions import Box as Box
 from .geometry.regions import Cylinder as Cylinder
 from .geometry.regions import Sphere as Sphere
-from .metrics.chamfer import chamfer_distance as chamfer_distance
-from .metrics.frechet_video import frechet_distance as frechet_distance
 from .mpm.boundary import Boundary as Boundary
 from .mpm.contact import Contact as Contact
 from .mpm.forces import Force as Force
@@ -24,7 +21,6 @@ from .mpm.pins import PinnedRegion as PinnedRegion
 from .mpm.solver import MPMSolver as MPMSolver
 from .mpm.state import MaterialPoints as MaterialPoints
 from .mpm.state import MPMState as MPMState
-from .mpm.state import support_force as support_force
 from .recording.recorder import Recorder as Recorder
 from .recording.trajectory import load_trajectory as load_trajectory
 from .rendering.cameras.camera_path import LookAtCamera as LookAtCamera

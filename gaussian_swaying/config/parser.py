@@ -128,6 +128,7 @@ def _parser_class() -> type[ArgumentParser]:
             self, args: Sequence[str] | None = None, *more: Any, **options: Any
         ) -> Any:
             words = with_lists(sys.argv[1:] if args is None else args)
+            refuse_gone({word[2:].partition("=")[0]: None for word in words if word.startswith("--")})
             return super().parse_args(with_material_option(words), *more, **options)
 
     return Parser

@@ -25,6 +25,7 @@ FIGURE = (
     (-0.18, -0.26, 0.10, 0.12),
     (0.18, -0.26, 0.10, 0.12),
 )
+_OVERLAP = 0.6  # standard deviation of a Gaussian, per spacing
 _JITTER = 0.3  # largest random shift of points of the lattice, per spacing
 _BLEND = 0.02  # radius over which the balls of the figure blend into each other, for a height of 1
 
@@ -66,19 +67,15 @@ class SolidScene(ProceduralScene):
         size: Height of the figure, diameter of the ball, longest side of the box, outer diameter of the torus [m].
         spacing: Distance between Gaussians [m], at most a quarter of the size.
         gaussians: ``throughout``, or ``shell`` for a hollow splat, as captures are.
-        overlap: Standard deviation of a Gaussian as a share of the spacing.
-        seed: Seed of the jitter.
     """
 
     shape: Literal["figure", "ball", "box", "torus"] = "figure"
     size: float = 1.0
     spacing: float = 0.02
     gaussians: Literal["throughout", "shell"] = "throughout"
-    overlap: float = 0.6
-    seed: int = 0
 
     def __post_init__(self) -> None:
-        self.check("size", "overlap")
+        self.check("size")
         if self.spacing > 0.25 * self.size:
             raise ValueError(
                 f"Expected `generator.spacing` to be at most a quarter of the size, but got {self.spacing} m."
@@ -97,7 +94,7 @@ class SolidScene(ProceduralScene):
         return lambda points: figure_distance(points, self.size)
 
     def generate(self) -> GaussianCloud:
-        h, draw = self.spacing, torch.Generator().manual_seed(self.seed)
+        h, draw = self.spacing, torch.Generator().manual_seed(0)
         reach = 0.5 * self.size + h
         steps = torch.arange(-reach, reach + h, h, dtype=torch.float64)
         points = torch.cartesian_prod(steps, steps, steps)
@@ -112,7 +109,7 @@ class SolidScene(ProceduralScene):
         if self.gaussians == "throughout":
             core = points[distance <= -0.5 * h]
             means, normals = torch.cat([skin, core]), torch.cat([normals, self.normal(core)])
-        sigma = self.overlap * h
+        sigma = _OVERLAP * h
         scales = torch.tensor([sigma, sigma, 0.1 * sigma], dtype=torch.float64).log().expand(len(means), 3)
         shade = 1 + 0.06 * torch.randn(len(means), 1, generator=draw, dtype=torch.float64)
         colours = torch.tensor([0.86, 0.70, 0.46], dtype=torch.float64) * shade

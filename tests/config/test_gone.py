@@ -23,3 +23,5 @@ def test_a_file_and_an_option_with_such_a_name_are_refused(given, tmp_path):
         Simulation.from_yaml(path)
     with pytest.raises(Exception, match="`VaseScene` is gone"):
         Simulation.parser().parse_args([f"--scene.generator={given}"])
+    with value_error("`recorder.images` is gone: use `recorder.renders`"):
+        Simulation.parser().parse_args(["--recorder.images", "false"])

@@ -34,7 +34,6 @@ from gaussian_swaying import (
     PinnedRegion,
     Recorder,
     Scene,
-    SimFrame,
     Simulation,
     SineSway,
     Sphere,
@@ -45,6 +44,7 @@ from gaussian_swaying import (
 from gaussian_swaying._fixed import fields_of
 from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.gaussians.parts import Part, Parts
+from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.laws.plastic import Sand
 from gaussian_swaying.mpm.pins import Impulse
 from gaussian_swaying.scenes.procedural import FlagScene

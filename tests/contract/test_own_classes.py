@@ -130,7 +130,7 @@ def test_an_unknown_of_a_fit(extensions, tmp_path):
 def test_an_axis_of_a_sweep(extensions, tmp_path):
     sweep_file = _yaml("An axis of a sweep")
     sweep_file["base"] = str(tmp_path / "ribbon.yaml")
-    settings = {"scene": {"generator": own("Ribbon")}, "recorder": {"images": False, "video": False}, "frames": 2}
+    settings = {"scene": {"generator": own("Ribbon")}, "recorder": {"renders": []}, "frames": 2}
     (tmp_path / "ribbon.yaml").write_text(yaml.safe_dump(settings | {"solver": {"dx": 0.2}}))
     (tmp_path / "sweep.yaml").write_text(yaml.safe_dump(sweep_file))
     assert (

@@ -5,7 +5,7 @@ import torch
 from catalogue import OBSTACLES
 from shared import double, near, seeded
 
-from gaussian_swaying import SimFrame
+from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.geometry.rotations import rotation_from_z
 from gaussian_swaying.kernels.launch import lanes, launch

@@ -53,10 +53,9 @@ def test_the_shell_covers_the_surface():
 
 
 def test_the_same_arguments_give_the_same_splat():
-    first, again, other = (SolidScene(spacing=0.1, seed=seed).generate() for seed in (0, 0, 1))
+    first, again = (SolidScene(spacing=0.1).generate() for _ in range(2))
     assert torch.equal(first.means, again.means)
     assert torch.equal(first.sh, again.sh)
-    assert first.means.shape != other.means.shape or not torch.equal(first.means, other.means)
 
 
 @pytest.mark.parametrize(
@@ -66,7 +65,6 @@ def test_the_same_arguments_give_the_same_splat():
         ({"gaussians": "none"}, "generator.gaussians"),
         ({"size": 0.0}, "generator.size"),
         ({"spacing": 0.3}, "quarter of the size"),
-        ({"overlap": -1.0}, "generator.overlap"),
     ],
 )
 def test_bad_settings_are_refused(settings, words):

@@ -11,8 +11,9 @@ import torch
 from shared import EYE, double, longest, near, normalized, peak, rand, randn, seeded, solid, value_error
 from torch.testing import assert_close
 
-from gaussian_swaying import AeroForce, MPMSolver, SimFrame, WindField, WindForce, wind
+from gaussian_swaying import AeroForce, MPMSolver, WindField, WindForce, wind
 from gaussian_swaying._fixed import assign, changed
+from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.kernels.derive import on_tensors
 from gaussian_swaying.wind import effects
 from gaussian_swaying.wind.effects import (

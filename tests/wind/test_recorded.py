@@ -9,7 +9,8 @@ import torch
 from shared import EYE, double, value_error
 from torch.testing import assert_close
 
-from gaussian_swaying import SimFrame, WindField
+from gaussian_swaying import WindField
+from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.wind.effects import Moment
 from gaussian_swaying.wind.tables import FrozenWind, RecordedWind
 from gaussian_swaying.wind.wind_files import read_anemometer, read_bts, read_grid

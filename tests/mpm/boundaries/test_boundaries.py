@@ -12,8 +12,9 @@ from catalogue import BOUNDARIES, OBSTACLES, conditions, made
 from shared import alike, beyond, double, in_both, near, peak, rand, randn, seeded, value_error, without_waits
 from torch.testing import assert_close
 
-from gaussian_swaying import Box, Cylinder, MPMSolver, SimFrame, Sphere
+from gaussian_swaying import Box, Cylinder, MPMSolver, Sphere
 from gaussian_swaying._fixed import changed
+from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.geometry.regions import Everything, HalfSpace, Not, Union
 from gaussian_swaying.mpm.boundary import Nodes

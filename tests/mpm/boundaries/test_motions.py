@@ -9,8 +9,9 @@ from scipy.spatial.transform import Rotation
 from shared import ZERO, alike, beyond, double, in_both, longest, near, peak, solid, up_to
 from torch.testing import assert_close
 
-from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion, SimFrame, Sphere
+from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion, Sphere
 from gaussian_swaying._fixed import changed
+from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.pins import Impulse
 
 from .bodies import block, lone, march, run_for

@@ -27,7 +27,8 @@ from shared import (
 )
 from torch.testing import assert_close
 
-from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedPoints, PinnedRegion, SimFrame, support_force
+from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedPoints, PinnedRegion
+from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.geometry.regions import Everything, HalfSpace, Sphere
 from gaussian_swaying.mpm import pins as pinning
@@ -39,7 +40,7 @@ from gaussian_swaying.mpm.pins import (
     face,
     thickness,
 )
-from gaussian_swaying.mpm.state import GridSpec
+from gaussian_swaying.mpm.state import GridSpec, support_force
 from gaussian_swaying.mpm.transfer import bspline_stencil, gather
 
 DX, STEP = 0.1, 0.045
