@@ -79,5 +79,4 @@ def conditions(region):
         "plane": made("Wall", HalfSpace([0.11, 0.12, 0.23], [0.0, 1.0, 1.5]), "slip", 0.3),
         "box": made("Wall", Box([-0.13, 0.07, 0.13], [0.33, 0.43, 0.51]), "separate", 0.3),
         "velocity": made("VelocityBox", region, [0.1, 0.2, 0.3]),
-        "velocity that travels": made("VelocityBox", region, [0.1, 0.2, 0.3], travels=True),
     }

@@ -324,8 +324,7 @@ def _bounding_box(space: Turned) -> list[dict[str, Any]]:
 def _cuboid(take: Fields, space: Turned) -> list[dict[str, Any]]:
     region = box_about(take.vector("point"), take.vector("size"))
     velocity, window = space.vector(take.vector("velocity")), _window(take, required=False)
-    moving = {"travels": True} if any(velocity) else {}
-    made = [part("VelocityBox", region=region, velocity=velocity, **moving, **window)]
+    made = [part("VelocityBox", region=region, velocity=velocity, **window)]
     if take.number("reset", 0) == 1:
         rest = {"region": {"class_path": "Everything"}, "velocity": [0.0, 0.0, 0.0]}
         if window["start"] > 0:

@@ -183,14 +183,13 @@ class Wall(Boundary):
 
 
 class VelocityBox(Boundary):
-    """Gives the nodes inside a region a prescribed velocity.
+    """Gives the nodes inside a region, which travels with it, a prescribed velocity.
 
     Args:
         region: Region in which the nodes are driven, in scene units.
         velocity: Velocity [m/s], z up.
         start: Time from which it acts [s].
         end: Time from which it no longer acts [s]; None for never.
-        travels: Whether the region moves with ``velocity`` from ``start`` on; otherwise it stays where it is.
     """
 
     needs_position = True
@@ -201,10 +200,9 @@ class VelocityBox(Boundary):
         velocity: Sequence[float],
         start: float = 0.0,
         end: float | None = None,
-        travels: bool = False,
     ) -> None:
         super().__init__(start, end)
-        self.region, self.recordable, self.travels = region, region.recordable, bool(travels)
+        self.region, self.recordable = region, region.recordable
         self.register_buffer("velocity", torch.tensor(check_vector("velocity", velocity), dtype=torch.float64))
         self.velocity: Tensor
 
@@ -214,9 +212,7 @@ class VelocityBox(Boundary):
 
     def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
         assert nodes.position is not None
-        where = nodes.position
-        if self.travels:
-            where = where - (self.velocity * (nodes.time - self.start)).to(where)
+        where = nodes.position - (self.velocity * (nodes.time - self.start)).to(nodes.position)
         inside = self.region.contains(where) & self.active(nodes.time)
         return torch.where(inside[..., None], self.velocity.to(velocity), velocity)
 

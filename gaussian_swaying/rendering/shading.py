@@ -31,7 +31,6 @@ def diffuse_shading(
     ambient: float = 0.0,
     rest_normal: Tensor | None = None,
     view_direction: Tensor | None = None,
-    diffuse: float | None = None,
     specular: float = 0.0,
     shininess: float = 32.0,
 ) -> Tensor:
@@ -39,7 +38,7 @@ def diffuse_shading(
 
     .. math::
         L_o = s\,c + k_s \max(0, \mathbf{r} \cdot \mathbf{v})^\alpha, \qquad
-        s = a + k_d \max(0, \mathbf{n} \cdot \mathbf{L}),
+        s = a + (1 - a) \max(0, \mathbf{n} \cdot \mathbf{L}),
         \qquad \mathbf{r} = 2 (\mathbf{n} \cdot \mathbf{L})\, \mathbf{n} - \mathbf{L}
 
     (arXiv 2512.01306, "Lightweight Shading", whose diffuse form has a = 0 and no highlight). The highlight is white and
@@ -53,10 +52,9 @@ def diffuse_shading(
         normal: Unit normals, shape (..., 3).
         light: Unit vector towards the light, in the frame of the normals, shape (3,).
         two_sided: Use :math:`|\mathbf{n} \cdot \mathbf{L}|` in s, for normals without a known outside.
-        ambient: Coefficient a of ambient light.
+        ambient: Share a of ambient light, in [0, 1].
         rest_normal: Unit normals of the rest shape, shape (..., 3), for shading relative to it.
         view_direction: Unit vectors from the surface to the eye, in the same frame, shape (..., 3); for a highlight.
-        diffuse: Coefficient k_d; 1 - a if None.
         specular: Coefficient k_s of the highlight.
         shininess: Exponent :math:`\alpha` of the highlight.
 
@@ -73,11 +71,10 @@ def diffuse_shading(
     check_shape("light", light, 3)
     if rest_normal is not None:
         check_shape("rest_normal", rest_normal, 3)
-    share = 1.0 - ambient if diffuse is None else diffuse
 
     def factor(normal: Tensor) -> Tensor:
         cosine = (normal * light).sum(-1, keepdim=True)
-        return ambient + share * (cosine.abs() if two_sided else cosine.clamp_min(0.0))
+        return ambient + (1.0 - ambient) * (cosine.abs() if two_sided else cosine.clamp_min(0.0))
 
     scale = factor(normal) if rest_normal is None else _relative(factor(normal), factor(rest_normal))
     if specular == 0:
@@ -139,7 +136,6 @@ class DiffuseShader(Shader):
         light: Direction towards the light in the metric frame (z up), of any length.
         two_sided: Shade both sides of the surface in the same way.
         ambient: Share of ambient light, in [0, 1].
-        diffuse: Coefficient of the diffuse term, not negative; what ``ambient`` leaves of 1 if null.
         specular: Coefficient of the highlight of the Phong model, not negative.
         shininess: Exponent of the highlight, positive.
         relative: Shade relative to the rest shape, which then looks as captured.
@@ -158,7 +154,6 @@ class DiffuseShader(Shader):
         two_sided: bool = False,
         *,
         ambient: float = 0.0,
-        diffuse: float | None = None,
         specular: float = 0.0,
         shininess: float = 32.0,
         relative: bool = False,
@@ -166,17 +161,11 @@ class DiffuseShader(Shader):
         super().__init__()
         if not 0.0 <= ambient <= 1.0:
             raise ValueError(f"Expected `ambient` to be between 0 and 1, but got {ambient}.")
-        for name, value in (("diffuse", diffuse or 0.0), ("specular", specular)):
-            check_positive(name, value, allow_zero=True)
+        check_positive("specular", specular, allow_zero=True)
         check_positive("shininess", shininess)
         self.register_buffer("light", _unit_light(light), persistent=False)
         self.two_sided, self.ambient, self.relative = bool(two_sided), float(ambient), bool(relative)
-        self.diffuse, self.specular, self.shininess = diffuse, float(specular), float(shininess)
-
-    @property
-    def glossy(self) -> bool:
-        """True if the colours depend on the place of the eye, or on a diffuse coefficient of their own."""
-        return self.specular > 0 or self.diffuse is not None
+        self.specular, self.shininess = float(specular), float(shininess)
 
     def forward(
         self,
@@ -189,5 +178,5 @@ class DiffuseShader(Shader):
         if self.relative and rest_normal is None:
             raise ValueError("Expected `rest_normal` to be given, because the shading is relative to the rest shape.")
         rest, light = rest_normal if self.relative else None, self.light.to(normal)
-        more = view_direction, self.diffuse, self.specular, self.shininess
+        more = view_direction, self.specular, self.shininess
         return diffuse_shading(color, normal, light, self.two_sided, self.ambient, rest, *more)

@@ -117,7 +117,7 @@ def drawable(snapshot: Snapshot) -> bool:
     shader = snapshot.simulation.painter.shader
     with _turn(snapshot.simulation):
         has_nodes = snapshot.simulation.scene.follow.nodes(snapshot.state) is not None
-    return has_nodes and (shader is None or (isinstance(shader, DiffuseShader) and not shader.glossy))
+    return has_nodes and (shader is None or (isinstance(shader, DiffuseShader) and not shader.specular))
 
 
 @torch.inference_mode()

@@ -68,7 +68,7 @@ def test_relative_leaves_the_rest_picture_unchanged(two_sided):
     normal, color, view = _random_normals(), rand(50, 3), _random_normals()
     for shader in (
         DiffuseShader((1.0, -2.0, 0.5), two_sided=two_sided, relative=True),
-        DiffuseShader((1.0, -2.0, 0.5), diffuse=0.7, specular=0.2, two_sided=two_sided, relative=True),
+        DiffuseShader((1.0, -2.0, 0.5), specular=0.2, two_sided=two_sided, relative=True),
     ):
         near(shader(color, normal, normal, view), color, 1e-15)
         assert peak(shader(color, _random_normals(), normal, view) - color) > 0.1
@@ -87,19 +87,19 @@ def test_phong_closed_form(dtype):
     color, normal, light = _case(dtype)
     eye = math.radians(50.0)
     view = torch.tensor([math.sin(eye), 0.0, math.cos(eye)], dtype=dtype)
-    shaded = diffuse_shading(color, normal, light, False, 0.1, None, view, 0.5, 0.3, 8.0)
-    expected = color * (0.1 + 0.5 * math.cos(math.radians(30.0))) + 0.3 * math.cos(math.radians(10.0)) ** 8
+    shaded = diffuse_shading(color, normal, light, False, 0.1, None, view, 0.3, 8.0)
+    expected = color * (0.1 + 0.9 * math.cos(math.radians(30.0))) + 0.3 * math.cos(math.radians(10.0)) ** 8
     torch.testing.assert_close(shaded, expected)
-    away = diffuse_shading(color, normal, light, False, 0.1, None, -view, 0.5, 0.3, 8.0)
-    torch.testing.assert_close(away, color * (0.1 + 0.5 * math.cos(math.radians(30.0))))
+    away = diffuse_shading(color, normal, light, False, 0.1, None, -view, 0.3, 8.0)
+    torch.testing.assert_close(away, color * (0.1 + 0.9 * math.cos(math.radians(30.0))))
 
 
 def test_phong_relative_subtracts_the_rest_highlight():
     color, normal, light = _case(torch.float64)
-    shader = DiffuseShader((0, 0, 3), ambient=0.2, diffuse=0.6, specular=0.5, shininess=4.0, relative=True)
+    shader = DiffuseShader((0, 0, 3), ambient=0.2, specular=0.5, shininess=4.0, relative=True)
     shaded = shader(color, normal, light, light)  # at rest: normal, light and eye coincide, highlight 1
     cosine = math.cos(math.radians(30.0))
-    expected = color * (0.2 + 0.6 * cosine) / 0.8 + 0.5 * (math.cos(math.radians(60.0)) ** 4 - 1.0)
+    expected = color * (0.2 + 0.8 * cosine) + 0.5 * (math.cos(math.radians(60.0)) ** 4 - 1.0)
     torch.testing.assert_close(shaded, expected.clamp_min(0.0))
     assert shaded.min() == 0.0
     assert shaded.max() > 0.0

@@ -11,6 +11,7 @@ from gaussian_swaying.gaussians.ply import read_ply
 from gaussian_swaying.recording.layout import video_file
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera
+from gaussian_swaying.rendering.cameras.keyframes import CameraKey
 from gaussian_swaying.rendering.passes import colormap, mean_depth
 from gaussian_swaying.rendering.shading import DiffuseShader
 from gaussian_swaying.simulation.draw import View
@@ -148,7 +149,7 @@ def test_a_camera_that_does_not_move_is_made_once(make_simulation):
     assert painter.camera_at(3) is first
     painter.camera = changed(painter.camera, azimuth=10.0 + painter.camera.azimuth)
     assert not torch.equal(painter.camera_at(3).world_to_camera, first.world_to_camera)
-    painter.camera = changed(painter.camera, degrees_per_second=5.0)
+    painter.camera = LookAtCamera(keys=[CameraKey(0.0, [0, -3, 0]), CameraKey(1.0, [1, -3, 0])], width=8, height=8)
     assert not torch.equal(painter.camera_at(4).position, painter.camera_at(3).position)
     painter.camera = LookAtCamera([0.0, -3.0, 0.0], [0.0, 0.0, 0.0], width=8, height=8)
     painter.cameras = {"top": OrbitCamera(elevation=80.0, width=8, height=8)}

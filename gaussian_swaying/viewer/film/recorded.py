@@ -142,7 +142,7 @@ def film_of(simulation: Simulation, grid: GridSpec, nodes: Tensor, displacement:
     color = sh_to_color(scene.model.sh0, torch.ones(count, 3, device=device))
     color = torch.cat([color, scene.model.opacity()[:, None]], dim=-1)
     shader, notes = painter.shader, []
-    if shader is not None and (not isinstance(shader, DiffuseShader) or shader.glossy):
+    if shader is not None and (not isinstance(shader, DiffuseShader) or shader.specular):
         notes.append(
             f"the film has no highlight of the {type(shader).__name__}: the Gaussians keep the colours of the splat."
         )
@@ -263,7 +263,7 @@ def spread(position: Tensor) -> Tensor:
 def look_of(painter: Painter) -> dict[str, Any]:
     """Light and background for the page; the light is None without a :class:`DiffuseShader`."""
     shader, light = painter.shader, None
-    if isinstance(shader, DiffuseShader) and not shader.glossy:
+    if isinstance(shader, DiffuseShader) and not shader.specular:
         light = {"light": shader.light.tolist(), "two_sided": shader.two_sided, "ambient": shader.ambient}
         light["relative"] = shader.relative
     return {"shader": light, "background": painter.background.tolist()}
