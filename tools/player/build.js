@@ -1,13 +1,12 @@
 // Writes film.min.js of the package, the programs of films and of both live pages with what they use of Spark and three.js,
 // sway.min.js for scenes of others, and worker.min.js, the solver in a browser.
-import asc from "assemblyscript/asc";
 import { build } from "esbuild";
 import { createHash } from "node:crypto";
 import { readFile } from "node:fs/promises";
 
 const OWN = "brush.js build.js bundle.js film.glsl.js film.js gaussians.js live.js main.js playback.js sorter.js view.js".split(" ");
 OWN.push(..."dial.js page.js settings.js".split(" ").map((name) => `live_web/${name}`));
-const SOLVER = "aero.js block.js body.js contact.js lanes.js laws.js matrices.js modal.js points.ts solver.js substep.wgsl touch.wgsl webgpu.js wind.js worker.js"
+const SOLVER = "aero.js block.js body.js contact.js kernels.js laws.js matrices.js modal.js solver.js substep.wgsl touch.wgsl webgpu.js wind.js worker.js"
   .split(" ")
   .map((name) => `live_web/${name}`);
 const SOURCES = [...OWN, "package-lock.json"]; // a test compares their checksum
@@ -61,26 +60,6 @@ await build({
   logLevel: "info",
 });
 
-// points.ts compiled to WebAssembly: points.wasm, and points.fused.wasm, which multiplies and adds in one instruction.
-async function compilePoints({ path }) {
-  const files = {};
-  const options = "-O3 --noAssert --runtime stub --enable simd --use abort= --outFile points.wasm".split(" ");
-  if (path.includes("fused")) options.push("--enable", "relaxed-simd");
-  const { error, stderr } = await asc.main(["live_web/points.ts", ...options], {
-    writeFile: (name, contents) => (files[name] = contents),
-  });
-  if (error) throw new Error(stderr.toString());
-  return { contents: files["points.wasm"], loader: "binary" };
-}
-
-const points = {
-  name: "points",
-  setup(made) {
-    made.onResolve({ filter: /points(\.fused)?\.wasm$/ }, ({ path }) => ({ path, namespace: "points" }));
-    made.onLoad({ filter: /.*/, namespace: "points" }, compilePoints);
-  },
-};
-
 // Shaders without comments and indents.
 async function readShader({ path }) {
   const lines = (await readFile(path, "utf8")).replace(/\/\*[^]*?\*\/|\/\/.*/g, "").split("\n");
@@ -98,5 +77,5 @@ await build({
   format: "iife",
   banner: await banner(["build.js", ...SOLVER, "package-lock.json"]),
   logLevel: "info",
-  plugins: [points, shaders],
+  plugins: [shaders],
 });

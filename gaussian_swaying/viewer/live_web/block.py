@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.geometry.regions import Box, Capsule, HalfSpace, Sphere
+from gaussian_swaying.kernels.launch import compiles
 from gaussian_swaying.mpm.colliders import Obstacle, Wall
 from gaussian_swaying.mpm.laws.elastic import FixedCorotated, NeoHookean, SpringNetwork, StVKHencky
 from gaussian_swaying.mpm.modes import Modes
@@ -23,6 +24,7 @@ from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.total import Total
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.film.page import message
+from gaussian_swaying.viewer.live_web.kernels import pack_kernels
 from gaussian_swaying.viewer.live_web.longest import longest_courant
 from gaussian_swaying.wind.effects import Moment
 from gaussian_swaying.wind.field import GaussianGust, SineSway, UniformGust, WindField, stream_start
@@ -84,16 +86,14 @@ def check(simulation: Simulation) -> None:
 
 
 def in_webassembly(simulation: Simulation) -> bool:
-    """True if the browser's fast pass over the points knows all that a simulation asks for (``points.ts``)."""
-    solver, aero = simulation.solver, simulation.aero
+    """True if a browser runs the package's kernels: on a grid that stands still, without walls."""
+    solver = simulation.solver
     assert isinstance(solver, MPMSolver)
-    known = {LAWS[0], LAWS[1]}
-    plain = simulation.stepper.idle or aero.drag_step != "semi_implicit"
     return (
         solver.formulation == "total"
-        and plain
-        and solver.stiffness_damping == 0
-        and all(type(law) in known for law in simulation.model.points.laws)
+        and compiles("cpu")
+        and simulation.model.points.position.dtype == torch.float32
+        and not any(isinstance(boundary, Wall) for boundary in solver.boundaries)
     )
 
 
@@ -199,10 +199,12 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
         "obstacles": obstacles,
         "iterations": bound.contact.iterations if bound.contact is not None else 0,
         "rows": rows,
-        "lanes": in_webassembly(simulation),
         "grouped": force.sums is not None,
         "aero": _aero(force),
     }
+    if in_webassembly(simulation):
+        kernels, more = pack_kernels(bound, None if head["idle"] else force)
+        head, arrays = head | {"kernels": kernels}, arrays | more
     return _joined(head, arrays)
 
 

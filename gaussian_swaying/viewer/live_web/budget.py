@@ -12,11 +12,11 @@ from gaussian_swaying.viewer.session import changed_settings
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
-TARGETS = {"phone": 2e6, "laptop": 5.5e6, "desktop": 8e6}
+TARGETS = {"phone": 1.1e6, "laptop": 3e6, "desktop": 4.4e6}
 """Material points times substeps of a run in a second that a kind of machine computes, with room for drawing."""
 
-IN_JAVASCRIPT = 4.0
-"""Factor by which a substep takes longer where the fast pass over the points does not know a law or a force."""
+IN_JAVASCRIPT = 3.0
+"""Factor by which a substep takes longer where it does not run in WebAssembly."""
 
 TRIALS = 5
 CLOSE = 0.8  # share of the budget that is good enough
@@ -24,7 +24,7 @@ POWER = 3.5  # of the cost in the spacing: 3 for a sheet, 4 for a solid
 
 
 def load_of(simulation: Simulation) -> float:
-    """Material points times substeps in a second of a simulation at rest [1/s], in those of the fast pass."""
+    """Material points times substeps in a second of a simulation at rest [1/s], in those of WebAssembly."""
     slower = 1.0 if in_webassembly(simulation) else IN_JAVASCRIPT
     steps = simulation.solver.substeps(simulation.start(), simulation.frame_dt)
     return slower * simulation.model.points.count * steps / simulation.frame_dt

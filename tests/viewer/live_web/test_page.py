@@ -24,7 +24,7 @@ def test_after_two_seconds_the_gaussians_are_where_a_run_puts_them(show, written
     page.evaluate("windPage.complete.then(() => { windPage.pause(); windPage.reset(); })")
     told = page.evaluate("windPage.advance(50)")
     assert told["simulated"] == pytest.approx(2.0)
-    assert told["lanes"]
+    assert told["kernels"]
     assert page.evaluate("windPage.time() ?? 0") == pytest.approx(2.0)
     error, motion = drawn_apart(page, make())
     assert motion > 0.1

@@ -11,7 +11,7 @@ from gaussian_swaying.viewer.live_web.block import check, pack_solver
 from gaussian_swaying.viewer.live_web.page import PAGE
 
 from .conftest import apart, drawn_apart, opened
-from .test_block import CASES, OBSTACLES, PLANE, run
+from .test_block import CASES, OBSTACLES, run
 
 LOST = "WebGPU is not used, as {}: the processor computes the motion."
 
@@ -136,7 +136,7 @@ def test_a_page_after_two_seconds_and_after_its_device_is_lost(show, written, ma
     assert not page.locator("#note").is_visible()
     page.evaluate("windPage.lose()")
     told = page.evaluate("windPage.advance(10)")
-    assert told["lanes"]
+    assert told["kernels"]
     assert page.evaluate("windPage.solver()") == "webassembly"
     assert page.evaluate("windPage.time() ?? 0") == pytest.approx(2.4)
     assert drawn_apart(page, make())[0] < 0.01
@@ -165,10 +165,11 @@ def test_chosen_by_hand(show, written):
 BROKEN = "GPUDevice.prototype.createComputePipelineAsync = () => Promise.reject(new Error('no pipeline'));"
 OTHER = "Object.defineProperty(GPUAdapter.prototype, 'info', { value: { vendor: 'other' } });"
 ABSENT = "Object.defineProperty(navigator, 'gpu', { value: undefined });"
+MANY = OBSTACLES["ground and ball"][:1] * 33
 REASONS = {
     "its device failed: no pipeline": (BROKEN, {}),
     "this browser does not offer it": (ABSENT, {}),
-    "the scene has more than 32 planes or obstacles": ("", {"solver": {"boundaries": [PLANE] * 33}}),
+    "the scene has more than 32 planes or obstacles": ("", {"solver": {"boundaries": MANY}}),
 }
 
 
@@ -177,7 +178,7 @@ def test_where_there_is_no_webgpu_the_processor_computes(make, on_gpu, why):
     before, changes = REASONS[why]
     told, moved = on_gpu(make(**changes), {"kind": "frames", "count": 1}, before=before)
     assert told[0] == {"kind": "solver", "name": "webassembly", "why": why}
-    assert told[-1]["lanes"]
+    assert told[-1]["kernels"]
     assert longest(moved) > 0
 
 

@@ -146,10 +146,15 @@ export class Solver extends Body {
 
   // ---- a substep
 
+  /** How long forces act in a substep of `dt` [s]: the mean of the old one and the new one. */
+  kick(dt) {
+    return this.substep > 0 ? Math.min(0.5 * (this.substep + dt), 2 * dt) : dt;
+  }
+
   /** One substep of symplectic Euler of `dt` [s]; `looked` says that the state before it is measured. */
   step(dt, looked) {
     const { head } = this;
-    const kick = this.substep > 0 ? Math.min(0.5 * (this.substep + dt), 2 * dt) : dt;
+    const kick = this.kick(dt);
     if (!this.idle) this.wind.blow(this.time, this.blown);
     this.dragged = this.pull !== null || (!this.idle && this.aero.implicit);
     this.force.fill(0);
@@ -267,16 +272,21 @@ export class Solver extends Body {
 
   /** A spring and a damper to where the visitor pulls, on the points that are held. */
   pulls(/** @type {Pull} */ pull) {
-    const { rest, cellNodes } = this.a;
+    const { rest } = this.a;
     for (let p = 0; p < this.points; p++) {
       if (pull.held[p] === 0) continue;
-      const first = 27 * this.cell[p];
-      this.at(p, first);
+      this.at(p, 27 * this.cell[p]);
       interpolate(v27, velocity);
       const damping = tug(pull, p, place.map((x, m) => rest[3 * p + m] + x), velocity, out);
-      for (let k = 0; k < 27; k++) for (let m = 0; m < 3; m++) this.force[WIDE * cellNodes[first + k] + m] += weightOf(k) * out[m];
-      this.spreadResistance(first, damping);
+      this.push(p, out, damping);
     }
+  }
+
+  /** Adds a force [N] and its damping [kg/s] on the point that is worked on. */
+  push(p, force, damping) {
+    const first = 27 * this.cell[p];
+    for (let k = 0; k < 27; k++) for (let m = 0; m < 3; m++) this.force[WIDE * this.a.cellNodes[first + k] + m] += weightOf(k) * force[m];
+    this.spreadResistance(first, damping);
   }
 
   spreadResistance(first, drag) {

@@ -2,7 +2,6 @@
 // that at its end read back, so that all else is as in solver.js and another solver can go on where this one stops.
 import { QUICK, STRONGEST } from "./body.js";
 import { LOOKS, Solver, WIDE } from "./solver.js";
-import { areaVectors, tensorOf } from "./lanes.js";
 import substep from "./substep.wgsl";
 import touch from "./touch.wgsl";
 
@@ -61,6 +60,22 @@ function shares(/** @type {ArrayLike<number>} */ nodes, /** @type {ArrayLike<num
   const whole = new Uint32Array(both.buffer);
   for (let k = 0; k < nodes.length; k++) (whole[2 * k] = nodes[k]), (both[2 * k + 1] = weights[k]);
   return both;
+}
+
+/** Area vectors of the patches of each point, three numbers each. @param {Solver} solver @returns {number[][]} */
+function areaVectors({ a, head, points }) {
+  return Array.from({ length: points }, (_, p) => {
+    if (head.grouped) return Array.from(a.vectors.subarray(3 * a.firstVector[p], 3 * a.firstVector[p + 1]));
+    const area = a.patch[4 * p + 3];
+    return area > 0 ? [0, 1, 2].map((m) => area * a.patch[4 * p + m]) : [];
+  });
+}
+
+/** Six numbers of the sum of A N N^T of a point. @param {Solver} solver @param {number} p @returns {number[]} */
+function tensorOf({ a, head }, p) {
+  if (head.grouped) return Array.from(a.tensor.subarray(6 * p, 6 * p + 6));
+  const [x, y, z, area] = a.patch.subarray(4 * p, 4 * p + 4);
+  return [x * x, x * y, x * z, y * y, y * z, z * z].map((square) => area * square);
 }
 
 /** Why a scene is not simulated in compute shaders; null if it is. @returns {string | null} */

@@ -1,6 +1,6 @@
 // Runs the solver beside the page, in step with the clock. What it understands is in `does`, what it says in `post`.
 import { readBlock } from "./block.js";
-import { LanesSolver } from "./lanes.js";
+import { KernelSolver } from "./kernels.js";
 import { ModalSolver } from "./modal.js";
 import { Solver } from "./solver.js";
 import { GpuSolver, NoWebGPU, openGpu } from "./webgpu.js";
@@ -38,9 +38,9 @@ const post = (/** @type {any} */ message, /** @type {Transferable[]} */ moved = 
 /** The fastest solver on the processor that this browser has, or with `plain` that in JavaScript. */
 function made() {
   if (block.head.modes) return new ModalSolver(block);
-  if (!plain && block.head.lanes) {
+  if (!plain && block.head.kernels) {
     try {
-      return new LanesSolver(block);
+      return new KernelSolver(block);
     } catch {
       // a browser without WebAssembly for four numbers at a time
     }
@@ -52,7 +52,7 @@ const queue = (/** @type {() => any} */ task) => (chain = chain.then(task).catch
 
 /** Says what computes, and why it is not WebGPU, once that is known. @param {string | null} why */
 function tell(why = null) {
-  const name = solver instanceof GpuSolver ? "webgpu" : solver instanceof LanesSolver ? "webassembly" : "javascript";
+  const name = solver instanceof GpuSolver ? "webgpu" : solver instanceof KernelSolver ? "webassembly" : "javascript";
   post({ kind: "solver", name, why });
 }
 
@@ -214,7 +214,7 @@ const does = {
     let substeps = 0;
     for (let k = 0; k < count; k++) substeps += await forward();
     show();
-    post({ kind: "done", gpu: solver instanceof GpuSolver, lanes: solver instanceof LanesSolver, substeps, seconds: (performance.now() - began) / 1000, simulated: count * solver.head.frameDt });
+    post({ kind: "done", gpu: solver instanceof GpuSolver, kernels: solver instanceof KernelSolver, substeps, seconds: (performance.now() - began) / 1000, simulated: count * solver.head.frameDt });
   },
   lose() {
     if (solver instanceof GpuSolver) solver.device.destroy();

@@ -1,0 +1,64 @@
+"""The kernels of a page that simulates: the package's own, as WebAssembly, and the memory of a body at rest.
+
+``tools/player/live_web/kernels.js`` writes the times and the wind of each substep to the first rows of their tables.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.kernels import wasm
+from gaussian_swaying.kernels.cpu import recording
+from gaussian_swaying.kernels.launch import narrowed
+from gaussian_swaying.mpm.run import at_home
+from gaussian_swaying.mpm.total import Total, TotalRun
+from gaussian_swaying.wind.force import WindForce
+
+
+def pack_kernels(bound: Total, force: WindForce | None) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """What a page needs to run the kernels: numbers for the head of its block, and arrays.
+
+    Args:
+        bound: The body at rest, on a CPU.
+        force: The wind; None if it does nothing.
+    """
+    function = None if force is None else force.device_function()
+    with narrowed(wasm.LANES), at_home(bound.node_mass):
+        run = TotalRun(bound)
+        run.force_in = torch.zeros(run.count, 4, **run.like)
+        options = run.options_for([] if function is None else [function])
+        run.begin(1, False)
+        if run.touching is not None:
+            run.touching.take(run.time, run.dt, 1)
+        with recording() as free:
+            run.substep(0, options)
+        with recording() as pulled:
+            run.substep(0, options | {"FORCE": True, "IMPLICIT": True})
+        with recording() as looked:
+            if run.watches:
+                run._look()
+        with recording() as read:
+            state = run._look_at()
+        for left in (run.fields, run.load, run.joined, *run._seen.values(), *run._partial.values()):
+            left.zero_()
+        tensors = {
+            "fields": run.fields,
+            "schedule": run.schedule,
+            "winds": run.loads.rows,
+            "material": run.material,
+            "force": run.force_in,
+            **({"fastest": run.speed} if run.watches else {}),
+            "clock": run.time,
+            "step": run.dt,
+            "velocity": state.velocity,
+            "F": state.F_total,
+        }
+        image = wasm.image({"free": free, "pulled": pulled, "look": looked, "read": read}, tensors)
+    fused, plain = image.modules
+    parts = {"image": image.memory, "fusedCode": fused, "plainCode": plain}
+    arrays = {name: torch.frombuffer(bytearray(part), dtype=torch.int8) for name, part in parts.items()}
+    arrays |= {"active": run.active, "order": run.order}
+    return {"start": wasm.START, "places": image.places}, arrays
