@@ -59,8 +59,8 @@ def check(simulation: Simulation) -> None:
         raise _refused("`edits`", "leave them out")
     if simulation.stepper.joints:
         raise _refused("joints of `scene.parts`", "leave out `joint_stiffness` and `joint_turning` of its parts")
-    if model.points.bending is not None:
-        raise _refused("`material.bending` of a sheet of one layer", "set `scene.layers` to 3")
+    if model.points.bending is not None and not in_webassembly(simulation):
+        raise _refused("`material.bending` of a sheet of one layer beside a Wall", "set `scene.layers` to 3")
     if model.aero.carried:
         raise _refused("the air that the material carries", "set `aero.added_mass` to 0")
     if model.air is not None:
@@ -204,7 +204,8 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
     }
     if in_webassembly(simulation):
         kernels, more = pack_kernels(bound, None if head["idle"] else force)
-        head, arrays = head | {"kernels": kernels}, arrays | more
+        head |= {"kernels": kernels, "bending": float(bound.bending_rate) * settings.dx**2 / 6}
+        arrays |= more
     return _joined(head, arrays)
 
 

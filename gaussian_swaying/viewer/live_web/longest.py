@@ -21,8 +21,9 @@ def longest_courant(bound: Total) -> float:
     Args:
         bound: The body on its grid.
     """
-    wave = float(wave_speed(bound.points).max())
-    return MARGIN * 2 / fastest_vibration(bound) * wave / bound.settings.dx
+    cells = float(wave_speed(bound.points).max()) / bound.settings.dx
+    fastest = (fastest_vibration(bound) ** 2 + float(bound.bending_rate)) ** 0.5
+    return MARGIN * 2 / fastest * bound.with_bending(cells)
 
 
 def fastest_vibration(bound: Total) -> float:

@@ -25,6 +25,7 @@ export class KernelSolver extends Solver {
     this.clock = view("clock", Float64Array);
     this.length = view("step", Float64Array);
     this.moduli = this.tables.material.slice(this.points, 3 * this.points);
+    this.curving = this.tables.curving?.slice(); // the square of which is a stiffness
     this.stiffened = 1;
     this.inside = false; // whether the state is that in the memory
   }
@@ -56,7 +57,12 @@ export class KernelSolver extends Solver {
     const { tables, seen, stiffness, head, inside } = this;
     if (seen.time === this.time && seen.stiffness === stiffness) return;
     this.exchange(inside);
-    if (!tables.fastest) return super.look(); // of several laws
+    const bending = Math.sqrt(stiffness * head.bending); // see Formulation.with_bending
+    if (!tables.fastest) { // several laws
+      super.look();
+      this.seen.wave = Math.hypot(this.seen.wave, bending);
+      return;
+    }
     this.stiffen();
     tables.fastest[0] = 0;
     this.kernels.look();
@@ -68,13 +74,15 @@ export class KernelSolver extends Solver {
     }
     for (let p = 0; head.viscous > 0 && p < this.points; p++)
       stretched = Math.max(stretched, largestSquare(tables.F.subarray(9 * p, 9 * p + 9)));
-    this.seen = { time: this.time, stiffness, wave: tables.fastest[0], viscous: head.viscous * stretched };
+    const wave = Math.hypot(tables.fastest[0], bending);
+    this.seen = { time: this.time, stiffness, wave, viscous: head.viscous * stretched };
   }
 
   stiffen() {
     if (this.stiffened === this.stiffness) return;
     this.stiffened = this.stiffness;
     this.tables.material.set(this.moduli.map((x) => x * this.stiffness), this.points);
+    this.tables.curving?.set(this.curving.map((x) => x * Math.sqrt(this.stiffness)));
   }
 
   /** See Solver. */

@@ -80,6 +80,7 @@ function tensorOf({ a, head }, p) {
 
 /** Why a scene is not simulated in compute shaders; null if it is. @returns {string | null} */
 export function uncovered({ head, arrays }) {
+  if (head.bending > 0) return "the sheet bends by itself";
   if (Math.max(head.obstacles.length, head.planes.length) > MOST) return `the scene has more than ${MOST} planes or obstacles`;
   if (9 * (arrays.cellStart.length - 1) > GROUP * MOST_GROUPS) return "the scene has too many points";
   return null;

@@ -41,8 +41,8 @@ function made() {
   if (!plain && block.head.kernels) {
     try {
       return new KernelSolver(block);
-    } catch {
-      // a browser without WebAssembly for four numbers at a time
+    } catch (error) {
+      if (block.head.bending > 0) throw error; // a browser without WebAssembly for four numbers at a time
     }
   }
   return new Solver(block);
