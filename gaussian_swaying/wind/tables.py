@@ -224,8 +224,10 @@ class CarriedField(Tabulated):
         step, first = (torch.tensor(v, dtype=torch.float64) for v in (self.spacing, anchor))
         super().__init__(table, step, origin, wraps)
         self.register_buffer("anchor", first, persistent=False)
+        self.register_buffer("start", torch.zeros_like(first), persistent=False)
 
     anchor: Tensor
+    start: Tensor
 
     def along(self, flow: Tensor) -> WindEffect:
         """The field with its x axis turned into the flow."""
@@ -233,7 +235,7 @@ class CarriedField(Tabulated):
 
     def now(self, moment: Moment) -> Tensor:
         """The place of the object's centre in the field, in its first period where it repeats, and the strength."""
-        place = self.anchor - (self.place + moment.carried) @ self.axes.T
+        place = self.anchor - (self.place + self.start + moment.carried) @ self.axes.T
         parts = zip(place.unbind(-1), (self.sizes * self.step).unbind(), self.wraps, strict=True)
         place = torch.stack([x.remainder(side) if wraps else x for x, side, wraps in parts], dim=-1)
         return torch.cat([place / self.step, torch.zeros_like(place[:, :1]) + self.strength(moment.flow)], dim=-1)

@@ -280,6 +280,7 @@ class Turbulence(CarriedField):
         cells: Cells of the box along the wind, across and up.
         spacing: Side of a cell [m]; a sixteenth of ``length`` if null.
         seed: Another seed is another turbulence.
+        start: How far the air has come when the run begins [m], z up: another stretch of the same turbulence.
 
     Example:
         >>> gusts = Turbulence(intensity=0.2, length=1.0, cells=[32, 16, 16], spacing=0.25)
@@ -298,6 +299,7 @@ class Turbulence(CarriedField):
         cells: Sequence[int] = (256, 128, 128),
         spacing: float | None = None,
         seed: int = 0,
+        start: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
         check_positive("intensity", intensity, allow_zero=True)
         check_positive("length", length)
@@ -309,6 +311,7 @@ class Turbulence(CarriedField):
         relative = 1 / math.sqrt(sheared_variances(float(gamma))[0])  # the component along the wind has the intensity
         # Mann's box has a direction, and so has one whose repetition is avoided by a turn
         super().__init__(table, [side] * 3, scale=float(intensity) * relative, tilted=gamma == 0)
+        self.start = torch.tensor(check_vector("start", start), dtype=torch.float64)
         self.intensity, self.length, self.spectrum, self.gamma = float(intensity), float(length), spectrum, float(gamma)
 
     @property

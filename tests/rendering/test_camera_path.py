@@ -13,14 +13,15 @@ from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCa
 from gaussian_swaying.rendering.cameras.keyframes import CameraKey
 
 
-def test_orbit_path_scales_with_the_object():
+def test_orbit_path_scales_with_the_object_and_turns_with_time():
     path = OrbitCamera(
         64,
         48,
         fov_y=30.0,
-        azimuth=90.0,
+        azimuth=10.0,
         elevation=20.0,
         radius=3.0,
+        degrees_per_second=40.0,
         target_offset=(0.0, 0.5, 0.0),
     )
     center, up = double([1.0, 2.0, 3.0]), torch.tensor([0.0, 0.0, 1.0])

@@ -16,7 +16,6 @@ from gaussian_swaying.gaussians.ply import read_ply
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.rendering.cameras.camera import orbit_camera
 from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera
-from gaussian_swaying.rendering.cameras.keyframes import CameraKey
 from gaussian_swaying.rendering.gsplat_renderer import GsplatRenderer, make_renderer
 from gaussian_swaying.rendering.shading import DiffuseShader
 from gaussian_swaying.rendering.torch_renderer import render_torch
@@ -470,8 +469,7 @@ def test_a_picture_never_makes_the_host_wait(name, degree, make_cloud, make_simu
     """But in gsplat, which asks how many tiles the Gaussians touch: what happens in there is not looked at."""
     gsplat = pytest.importorskip("gsplat")
     shader, settings = PICTURES[name]
-    keys = [CameraKey(0.0, azimuth=-60.0, elevation=15.0, radius=2.0), CameraKey(1.0, azimuth=40.0)]
-    camera = LookAtCamera(keys=keys, width=64, height=36)
+    camera = OrbitCamera(width=64, height=36, degrees_per_second=100.0)
     simulation = make_simulation(make_cloud(degree=degree), pinned=False, shader=shader, scene=settings, camera=camera)
     simulation = _on_gpu(simulation)
     if not isinstance(simulation.painter.renderer, GsplatRenderer):

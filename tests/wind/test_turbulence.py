@@ -8,7 +8,7 @@ import math
 
 import pytest
 import torch
-from shared import EYE, double, near, peak, rand, seeded, value_error
+from shared import EYE, double, near, peak, rand, randn, seeded, value_error
 from torch.testing import assert_close
 
 from gaussian_swaying.kernels.derive import Memory, on_tensors
@@ -422,6 +422,17 @@ def test_a_simulation_takes_a_look_by_its_name(make_simulation):
     assert wind.effects[0].intensity == LOOKS["gusts"].intensity
     with value_error("one of breeze, gusts, storm"):
         make_simulation(wind="gales")
+
+
+def test_a_start_is_a_later_time():
+    """The air has come the start's way: U t."""
+    flow, places = [6.0, 2.0, 0.0], randn(20, 3, generator=seeded(0))
+    plain = WindField(flow, effects=[Turbulence(0.3, 1.5)])
+    later = WindField(flow, effects=[Turbulence(0.3, 1.5, start=[7.0 * c for c in flow])])
+    for time in (0.0, 1.3):
+        found, expected = (wind.at(double(t), places) for wind, t in ((later, time), (plain, time + 7.0)))
+        near(found, expected, 1e-4)  # places of float32 in a box of some 100 cells
+    assert not torch.allclose(found, plain.at(double(1.3), places), atol=0.1)
 
 
 def _theirs(mann, cells, spacing, gamma, seed):

@@ -101,7 +101,7 @@ class PinholePath(CameraPath):
 
 @dataclass(eq=False)
 class OrbitCamera(PinholePath):
-    """Camera on a sphere around the object that looks at it; keys of a LookAtCamera move around it.
+    """Camera on a sphere around the object that looks at it and may move around the up direction.
 
     See :func:`orbit_camera` for the definition of azimuth and elevation.
 
@@ -109,9 +109,10 @@ class OrbitCamera(PinholePath):
         width: Image width [pixels].
         height: Image height [pixels].
         fov_y: Vertical field of view [degrees].
-        azimuth: Angle about the up direction [degrees].
+        azimuth: Angle about the up direction at time 0 [degrees].
         elevation: Angle above the horizontal plane [degrees], between -90 and 90 (both excluded).
         radius: Distance from the target, in multiples of the object's longest side.
+        degrees_per_second: Speed of the azimuth [degrees/s].
         target_offset: Vector from the object's centre to the target, along the scene's axes, in multiples of the
             object's longest side.
 
@@ -120,27 +121,34 @@ class OrbitCamera(PinholePath):
         ValueError: If a number is out of range.
     """
 
-    still = True
     width: int = 960
     height: int = 540
     _: KW_ONLY
     azimuth: float = -60.0
     elevation: float = 15.0
     radius: float = 2.0
+    degrees_per_second: float = 0.0
     target_offset: Sequence[float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_vector("azimuth", [self.azimuth], 1)
+        for name in ("azimuth", "degrees_per_second"):
+            check_vector(name, [getattr(self, name)], 1)
         check_elevation("elevation", self.elevation)
         check_positive("radius", self.radius)
         self.target_offset = check_vector("target_offset", self.target_offset)
+
+    @property
+    def still(self) -> bool:  # type: ignore[override]
+        """True if it does not move."""
+        return self.degrees_per_second == 0
 
     def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
         """Camera of a frame, see :meth:`CameraPath.__call__`."""
         check_positive("size", size)
         target = [c + size * o for c, o in zip(check_vector("center", center), self.target_offset, strict=True)]
-        return orbit_camera(target, up, size * self.radius, self.azimuth, self.elevation, **self.picture(center))
+        azimuth = self.azimuth + self.degrees_per_second * time
+        return orbit_camera(target, up, size * self.radius, azimuth, self.elevation, **self.picture(center))
 
 
 @dataclass(eq=False)
