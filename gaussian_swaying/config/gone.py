@@ -28,6 +28,7 @@ GONE = {
     "TransformsCamera": "CaptureCamera with `view`",
     **{f"{name}Camera.near": "the default, a hundredth of the distance" for name in ("Orbit", "LookAt", "Capture")},
     "recorder.images": "`recorder.renders`, which may be empty",
+    "contact.iterations": "the default, 100",
     "air.lattice_speed": "`air.speed`",
     **{f"{name}Camera.interpolation": "the default, smooth" for name in ("LookAt", "Capture")},
     **{f"SolidScene.{name}": "the default" for name in ("jitter", "overlap", "seed")},

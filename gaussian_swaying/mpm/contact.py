@@ -40,7 +40,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -59,6 +59,9 @@ from gaussian_swaying.mpm.state import GridSpec, MaterialPoints
 from gaussian_swaying.mpm.transfer import bspline_stencil
 from gaussian_swaying.mpm.virtual_nodes import coordinates, point_with_nodes
 
+MOST_ITERATIONS = 100
+"""For the impulses of a substep: two or three are made where sheets touch, and 16 are enough for a pile of eight."""
+
 APART = 2.0
 """Samples closer than this at rest [cells] are neighbours: they share nodes, and a fold cannot be sharper."""
 
@@ -74,8 +77,6 @@ class Contact:
         thickness: Distance that two surfaces keep [m]; null for the thickness of the material at each place. Obstacles
             are kept at half of it.
         friction: Coulomb coefficient.
-        iterations: Most iterations for the impulses of a substep. Two or three are made where sheets touch, more at
-            an impact and in a pile; 16 are enough for eight layers.
 
     Raises:
         ValueError: If a number is out of range.
@@ -83,17 +84,11 @@ class Contact:
 
     thickness: float | None = None
     friction: float = 0.3
-    _: KW_ONLY
-    iterations: int = 100
 
     def __post_init__(self) -> None:
         if self.thickness is not None:
             check_positive("contact.thickness", self.thickness)
         check_positive("contact.friction", self.friction, allow_zero=True)
-        if isinstance(self.iterations, bool) or not isinstance(self.iterations, int) or self.iterations < 1:
-            raise ValueError(
-                f"Expected `contact.iterations` to be a whole number of at least 1, but got {self.iterations}."
-            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +182,7 @@ class ContactStage:
     ) -> None:
         self.surface, self.contact, self.grid, self.dx = surface, surface.contact, grid, grid.dx
         self.obstacles = [(k, b) for k, b in enumerate(boundaries) if kinds[k] == "surface" and isinstance(b, Obstacle)]
-        self.iterations = Contact.iterations if self.contact is None else self.contact.iterations
+        self.iterations = MOST_ITERATIONS
         self.inverse_mass = inverse_mass.detach().reshape(-1)
         self.scenes = len(self.inverse_mass) // grid.node_count
         each = len(surface.place) // self.scenes

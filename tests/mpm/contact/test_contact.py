@@ -156,7 +156,7 @@ def test_contact_without_kernels_is_refused(transfer):
 
 
 def test_bad_settings_are_refused():
-    for name, value in (("thickness", 0.0), ("friction", -0.1), ("iterations", 0)):
+    for name, value in (("thickness", 0.0), ("friction", -0.1)):
         with value_error(f"`contact.{name}`"):
             Contact(**{name: value})
 

@@ -69,9 +69,10 @@ def _ends(device, contact, *parts, speed=1.0):
 
 
 @pytest.mark.parametrize("iterations", [1, 4])
-def test_a_collision_is_the_same_in_float32_and_float64(device, iterations):
+def test_a_collision_is_the_same_in_float32_and_float64(device, iterations, monkeypatch):
     """Four substeps of free flight and two of collision; round-off grows in it, but not to a thousandth of it."""
-    single, wide, solver = _ends(device, Contact(friction=0.1, iterations=iterations), 4, 2)  # they slide
+    monkeypatch.setattr(contact, "MOST_ITERATIONS", iterations)
+    single, wide, solver = _ends(device, Contact(friction=0.1), 4, 2)  # they slide
     assert solver.kernels.touching.rounds > 0
     (position, speed, taken), (expected, speeds, impulse) = single[1], wide[1]
     changed = float(peak(speed - single[0][1]))
@@ -87,11 +88,12 @@ def test_a_collision_is_the_same_in_float32_and_float64(device, iterations):
     assert_close(momentum, gravity, rtol=0, atol=1e-12)  # what the boundaries took is what the sheets lost
 
 
-def test_iterations_are_counted_where_there_are_obstacles(device):
+def test_iterations_are_counted_where_there_are_obstacles(device, monkeypatch):
     """One in every substep of a sheet that presses on the ground."""
+    monkeypatch.setattr(contact, "MOST_ITERATIONS", 1)
     points = sheet(5, 5, dtype=torch.float32).map(lambda t: t.to(device))
     ground = Obstacle(HalfSpace([0.0, 0.0, -0.004], [0.0, 0.0, 1.0]))
-    solver, state = scene(points, Contact(iterations=1), [ground], transfer="kernels", gravity=(0.0, 0.0, -9.8))
+    solver, state = scene(points, Contact(), [ground], transfer="kernels", gravity=(0.0, 0.0, -9.8))
     solver.rollout(state, DT, 6)
     assert solver.kernels.touching.rounds == 6
 
@@ -100,7 +102,7 @@ def test_the_lists_are_those_of_a_tree(device):
     """Sheets that lie across each other in many cells of the grid: both sides of all pairs, in a fixed order."""
     low = sheet(9, 9, dtype=torch.float32)
     points = MaterialPoints.join([low, sheet(9, 9, (0.0, 0.0, 0.4), dtype=torch.float32)]).map(lambda t: t.to(device))
-    solver, state = scene(points, Contact(iterations=1), transfer="kernels", gravity=ZERO)
+    solver, state = scene(points, Contact(), transfer="kernels", gravity=ZERO)
     moved = torch.zeros_like(state.node_displacement)
     upper = state.grid.node_positions(moved)[:, 2] > 0.2
     moved[upper] = torch.tensor([0.013, -0.007, 0.01 - 0.4], device=device)
@@ -125,7 +127,7 @@ def test_nodes_without_weight_do_not_widen_the_lists(device):
     dx = 0.044
     points = MaterialPoints.join([low, sheet(3, 3, (0.023, 0.017, 2.501 * dx), dtype=torch.float32)])
     points = points.map(lambda t: t.to(device))
-    solver, state = scene(points, Contact(iterations=4), gravity=ZERO)
+    solver, state = scene(points, Contact(), gravity=ZERO)
     mass = solver.bound.node_mass
     light = (mass > 0) & (mass < 1e-5 * mass.amax())
     assert int(light.sum()) > 4
@@ -146,7 +148,7 @@ def test_lists_that_do_not_fit_get_more_room(device, monkeypatch):
         monkeypatch.setattr(contact, "SLOTS", slots)
         # torch makes the masses of the nodes, on a GPU in no fixed order unless told to
         settings = {"transfer": "kernels", "deterministic": True}
-        solver, state = scene(points, Contact(iterations=2), velocity=velocity, **settings)
+        solver, state = scene(points, Contact(), velocity=velocity, **settings)
         ends.append(solver.rollout(state, 4 * DT, 2))
         rooms.append((solver.kernels.touching.room, solver.kernels.touching.slots))
     assert rooms[0] == (64, 32)
@@ -161,7 +163,7 @@ def test_material_that_has_collapsed_is_refused(device, monkeypatch):
     """More candidates than any buffer holds: a sentence, not wrong lists, and another rollout is possible."""
     monkeypatch.setattr(contact, "ROOM", 2)
     points, velocity, _ = _collision(device)
-    solver, state = scene(points, Contact(iterations=1), velocity=velocity, transfer="kernels")
+    solver, state = scene(points, Contact(), velocity=velocity, transfer="kernels")
     monkeypatch.setattr(contact, "MOST_ENTRIES", 1000 * points.count)
     solver.prepare()
     monkeypatch.setattr(contact, "MOST_ENTRIES", 100)
