@@ -179,12 +179,17 @@ def account(force, resistance, velocity, kick, before, IMPLICIT: tl.constexpr, l
 
 
 @triton.jit
+def squared_stretch(F, mu, lam):
+    """The square of the largest stretch, at least 1; the arguments are those of the wave of a law."""
+    return largest(largest_eigenvalue(matmul(transpose(F), F)), 1.0)
+
+
+@triton.jit
 def wave_speed(F, density, mu, lam, WAVE: tl.constexpr, SPATIAL: tl.constexpr):
     """Speed of a wave [m/s], as ``timestep.wave_speed``."""
     squared = WAVE(F, mu, lam) / density
     if SPATIAL:
-        stretch = largest_eigenvalue(matmul(transpose(F), F))
-        squared = squared * largest(stretch, 1.0)
+        squared = squared * squared_stretch(F, mu, lam)
     return tl.sqrt(squared)
 
 

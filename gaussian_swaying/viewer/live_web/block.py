@@ -1,8 +1,8 @@
 """The block of bytes that the solver in a browser needs, and the scenes that it cannot simulate.
 
 The block is the length of its head (uint32, little-endian), the head in JSON, and the arrays that the head lists, in
-float32 or whole numbers. The solvers are ``solver.js`` and ``modal.js`` in ``tools/player/live_web``; their definitions
-are :mod:`~gaussian_swaying.mpm.total` and :mod:`~gaussian_swaying.mpm.modes`.
+float32 or whole numbers. The solvers are ``kernels.js``, ``webgpu.js`` and ``modal.js`` in ``tools/player/live_web``;
+their definitions are :mod:`~gaussian_swaying.mpm.total` and :mod:`~gaussian_swaying.mpm.modes`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gaussian_swaying.geometry.regions import Box, Capsule, HalfSpace, Sphere
 from gaussian_swaying.kernels.launch import compiles
-from gaussian_swaying.mpm.colliders import Obstacle, Wall
+from gaussian_swaying.mpm.colliders import Obstacle
 from gaussian_swaying.mpm.laws.elastic import FixedCorotated, NeoHookean, SpringNetwork, StVKHencky
 from gaussian_swaying.mpm.modes import Modes
 from gaussian_swaying.mpm.pins import PinnedPoints, PinnedRegion
@@ -59,8 +59,6 @@ def check(simulation: Simulation) -> None:
         raise _refused("`edits`", "leave them out")
     if simulation.stepper.joints:
         raise _refused("joints of `scene.parts`", "leave out `joint_stiffness` and `joint_turning` of its parts")
-    if model.points.bending is not None and not in_webassembly(simulation):
-        raise _refused("`material.bending` of a sheet of one layer beside a Wall", "set `scene.layers` to 3")
     if model.aero.carried:
         raise _refused("the air that the material carries", "set `aero.added_mass` to 0")
     if model.air is not None:
@@ -77,24 +75,14 @@ def check(simulation: Simulation) -> None:
             raise _refused(f"the {type(modulation).__name__} in `wind.modulations`", "leave it out")
     if sways:  # it checks the rest itself
         return
+    if not compiles("cpu") or model.points.position.dtype != torch.float32:
+        raise _refused("what its kernels are not compiled for", "install llvmlite, and set `dtype` to float32")
     for law in model.points.laws:
         if type(law) not in LAWS:
             known = ", ".join(one.__name__ for one in LAWS)
             raise _refused(f"the law {type(law).__name__} in `material.law`", f"take one of {known}")
     for boundary in solver.boundaries:
         _check_boundary(boundary)
-
-
-def in_webassembly(simulation: Simulation) -> bool:
-    """True if a browser runs the package's kernels: on a grid that stands still, without walls."""
-    solver = simulation.solver
-    assert isinstance(solver, MPMSolver)
-    return (
-        solver.formulation == "total"
-        and compiles("cpu")
-        and simulation.model.points.position.dtype == torch.float32
-        and not any(isinstance(boundary, Wall) for boundary in solver.boundaries)
-    )
 
 
 def _check_boundary(boundary: Any) -> None:
@@ -105,12 +93,12 @@ def _check_boundary(boundary: Any) -> None:
             return
         if not boundary.still:
             raise _refused(f"the `path` of the {name}", "leave it out")
-    if type(boundary) not in (PinnedRegion, PinnedPoints, Wall):
-        known = ", ".join(one.__name__ for one in (PinnedRegion, PinnedPoints, Wall, Obstacle, *OBSTACLES))
+    if type(boundary) not in (PinnedRegion, PinnedPoints):
+        known = ", ".join(one.__name__ for one in (PinnedRegion, PinnedPoints, Obstacle, *OBSTACLES))
         raise _refused(f"the {name} in `solver.boundaries`", f"take one of {known}")
     if boundary.moves:
         raise _refused(f"the `velocity` of the {name}", "leave it out")
-    if type(boundary) is not Wall and not boundary.always:
+    if not boundary.always:
         raise _refused(f"`start` and `end` of the {name}", "leave them out")
 
 
@@ -153,11 +141,9 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
     row = torch.full_like(bound.node_mass, len(active), dtype=torch.long)
     row[active] = torch.arange(len(active))
     held = torch.zeros_like(bound.node_mass, dtype=torch.bool)
-    planes, obstacles = [], []
+    obstacles = []
     for boundary, own, acts in zip(bound.boundaries, bound.pinned, bound.on_nodes, strict=True):
-        if isinstance(boundary, Wall):
-            planes += [_plane(side) for side in boundary.sides]
-        elif isinstance(boundary, Obstacle):
+        if isinstance(boundary, Obstacle):
             obstacles.append(_obstacle(boundary))
         elif acts:
             assert own is not None
@@ -178,7 +164,6 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
         "inverseMass": torch.nn.functional.pad(bound.node_inverse_mass[active], (0, 1)),
         "held": held[active],
         "nodeDamping": bound.node_damping[active] if bound.node_damping is not None else points.mass.new_zeros(0),
-        "nodeRest": bound.node_rest[active] if bound.node_rest is not None else active.new_zeros(0),
         "followed": row[nodes],
         **_wind_arrays(force, order),
         **_samples(bound, row),
@@ -195,18 +180,15 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
     head |= {
         "cfl": solver.cfl,
         "longest": max(solver.cfl, longest_courant(bound)),
-        "planes": planes,
         "obstacles": obstacles,
         "iterations": bound.contact.iterations if bound.contact is not None else 0,
         "rows": rows,
         "grouped": force.sums is not None,
         "aero": _aero(force),
     }
-    if in_webassembly(simulation):
-        kernels, more = pack_kernels(bound, None if head["idle"] else force)
-        head |= {"kernels": kernels, "bending": float(bound.bending_rate) * settings.dx**2 / 6}
-        arrays |= more
-    return _joined(head, arrays)
+    kernels, more = pack_kernels(bound, None if head["idle"] else force)
+    head |= {"kernels": kernels, "bending": float(bound.bending_rate) * settings.dx**2 / 6}
+    return _joined(head, arrays | more)
 
 
 def _pack_modes(head: dict[str, Any], simulation: Simulation, bound: Modes, nodes: Tensor) -> bytes:
@@ -251,17 +233,6 @@ def _joined(head: dict[str, Any], arrays: dict[str, Tensor]) -> bytes:
         listed.append([name, kind, values.numel()])
         blocks.append(values.detach().cpu().contiguous().numpy().astype(np.dtype("<" + kind)).tobytes())
     return message(head | {"arrays": listed}, *blocks)
-
-
-def _plane(plane: Wall) -> dict[str, Any]:
-    return {
-        "point": plane.point.tolist(),
-        "normal": plane.normal.tolist(),
-        "kind": plane.kind,
-        "friction": plane.friction,
-        "start": plane.start,
-        "end": None if plane.end == math.inf else plane.end,
-    }
 
 
 def _obstacle(obstacle: Obstacle) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.viewer.live_web.block import check, in_webassembly
+from gaussian_swaying.viewer.live_web.block import check
 from gaussian_swaying.viewer.session import changed_settings
 
 if TYPE_CHECKING:
@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 TARGETS = {"phone": 1.1e6, "laptop": 3e6, "desktop": 4.4e6}
 """Material points times substeps of a run in a second that a kind of machine computes, with room for drawing."""
 
-IN_JAVASCRIPT = 3.0
-"""Factor by which a substep takes longer where it does not run in WebAssembly."""
+SWAYING = 3.0
+"""Factor by which a substep by modes takes longer."""
 
 TRIALS = 5
 CLOSE = 0.8  # share of the budget that is good enough
@@ -25,7 +25,7 @@ POWER = 3.5  # of the cost in the spacing: 3 for a sheet, 4 for a solid
 
 def load_of(simulation: Simulation) -> float:
     """Material points times substeps in a second of a simulation at rest [1/s], in those of WebAssembly."""
-    slower = 1.0 if in_webassembly(simulation) else IN_JAVASCRIPT
+    slower = SWAYING if simulation.solver.formulation == "modes" else 1.0
     steps = simulation.solver.substeps(simulation.start(), simulation.frame_dt)
     return slower * simulation.model.points.count * steps / simulation.frame_dt
 

@@ -13,7 +13,9 @@ from torch import Tensor
 from gaussian_swaying.kernels import wasm
 from gaussian_swaying.kernels.cpu import recording
 from gaussian_swaying.kernels.launch import narrowed
+from gaussian_swaying.mpm.dispatch import in_common
 from gaussian_swaying.mpm.run import at_home
+from gaussian_swaying.mpm.shared_kernels import squared_stretch
 from gaussian_swaying.mpm.total import Total, TotalRun
 from gaussian_swaying.wind.force import WindForce
 
@@ -37,25 +39,32 @@ def pack_kernels(bound: Total, force: WindForce | None) -> tuple[dict[str, Any],
             run.substep(0, options)
         with recording() as pulled:
             run.substep(0, options | {"FORCE": True, "IMPLICIT": True})
-        with recording() as looked:
-            if run.watches:
-                run._look()
         with recording() as read:
             state = run._look_at()
+        fastest = torch.zeros(2, **run.like)
+        run.speed, material = fastest[:1], run.material
+        with recording() as looked:
+            for k, law in enumerate(bound.points.laws):
+                run.wave, run.material = in_common([law], "wave"), material.clone()
+                run.material[0] *= run.law == k  # points of other laws have no volume, and so no wave
+                run._look()
+            if bound.settings.stiffness_damping > 0:
+                run.wave, run.speed, run.material = squared_stretch, fastest[1:], torch.ones_like(material)
+                run._look()
         for left in (run.fields, run.load, run.joined, *run._seen.values(), *run._partial.values()):
             left.zero_()
         tensors = {
             "fields": run.fields,
             "schedule": run.schedule,
             "winds": run.loads.rows,
-            "material": run.material,
+            "material": material,
             "force": run.force_in,
             **({"curving": run.curving} if run.bent else {}),
-            **({"fastest": run.speed} if run.watches else {}),
+            "fastest": fastest,
             "clock": run.time,
             "step": run.dt,
+            "position": state.position,
             "velocity": state.velocity,
-            "F": state.F_total,
         }
         image = wasm.image({"free": free, "pulled": pulled, "look": looked, "read": read}, tensors)
     fused, plain = image.modules

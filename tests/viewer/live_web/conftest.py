@@ -78,16 +78,15 @@ def written(make, tmp_path_factory):
 
 @pytest.fixture
 def in_node(node, request, tmp_path):
-    """Runs the built solver in Node.js, with ``plain`` without WebAssembly: its answers, and the last nodes (M, 3)."""
+    """Runs the built solver in Node.js: its answers, and the last nodes (M, 3)."""
 
-    def run(simulation, *messages, plain=False):
+    def run(simulation, *messages):
         check(simulation)
         state = simulation.start()
         nodes = simulation.scene.follow.nodes(state)
         (tmp_path / "block").write_bytes(pack_solver(simulation, nodes))
         script = request.config.rootpath / "tools/player/live_web/run.js"
         command = [node, script, PAGE / "worker.min.js", tmp_path / "block", tmp_path / "state", json.dumps(messages)]
-        command += ["plain"] if plain else []
         told = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
         moved = np.fromfile(tmp_path / "state", "<f4").reshape(len(nodes), 4)[:, :3]
         return json.loads(told.stdout), torch.from_numpy(moved.copy())

@@ -14,7 +14,12 @@ from .conftest import drawn_apart, opened
 @pytest.fixture
 def show(browser):
     context = browser.new_context(viewport={"width": 600, "height": 400})
-    yield lambda path, settings="": opened(context, path, settings)
+
+    def show(path, settings="", before=""):
+        context.add_init_script(before)
+        return opened(context, path, settings)
+
+    yield show
     context.close()
 
 
@@ -135,6 +140,14 @@ def test_a_file_that_is_cut_short_or_damaged_says_so(show, written, tmp_path):
     (tmp_path / "damaged.html").write_text(content[:at] + "AAAA" + content[at + 4 :])
     message = show(tmp_path / "damaged.html").locator("#message")
     message.filter(has_text=re.compile(r"^This page cannot be shown \([^()]+\)\.$")).wait_for()
+
+
+def test_a_browser_without_vectors_in_webassembly_says_so(show, written):
+    """Its worker, which is a Blob, accepts no module."""
+    old = "const All = Blob; Blob = class extends All { constructor(parts, given) "
+    old += "{ super(['WebAssembly.validate = () => false;', ...parts], given); } };"
+    message = show(written, before=old).locator("#message")
+    message.filter(has_text="This page cannot be shown (this browser has no WebAssembly with SIMD).").wait_for()
 
 
 def test_a_page_within_another_page(browser, written):

@@ -88,7 +88,7 @@ def both(one, other, part=None):
 
 MIXED = {
     "two laws, schedule, paper": both("two laws, schedule", "neo-hookean, paper", "aero"),
-    "hencky, cross flow, clamp and plane": both("hencky, cross flow", "clamp and plane"),
+    "hencky, cross flow, clamp": both("hencky, cross flow", "clamp"),
     "springs, viscous, pinned points": both("springs, viscous", "nodes and a point, still air", "solver"),
     "linear, semi-implicit": CASES["linear, semi-implicit"],
     "one patch, cross flow": CASES["one patch, cross flow"],
@@ -169,7 +169,7 @@ MANY = OBSTACLES["ground and ball"][:1] * 33
 REASONS = {
     "its device failed: no pipeline": (BROKEN, {}),
     "this browser does not offer it": (ABSENT, {}),
-    "the scene has more than 32 planes or obstacles": ("", {"solver": {"boundaries": MANY}}),
+    "the scene has more than 32 obstacles": ("", {"solver": {"boundaries": MANY}}),
 }
 
 

@@ -37,32 +37,6 @@ const pressed = new Float64Array(3);
 const tangent = new Float64Array(3);
 
 /**
- * The force on one patch that deforms with its point.
- * @param {Aero} aero @param {Float64Array} wind [m/s] @param {number} v0 velocity of the point [m/s] @param {number} v1 @param {number} v2
- * @param {Float64Array} F deformation gradient @param {Float64Array} patch unit normal and area at rest of all points
- * @param {number} at index of those of the point @param {Float64Array} out force [N] and resistance [kg/s]
- */
-export function onPatch(aero, wind, v0, v1, v2, F, patch, at, out) {
-  const rest = patch[at + 3];
-  const N0 = patch[at], N1 = patch[at + 1], N2 = patch[at + 2];
-  const f0 = F[0], f1 = F[1], f2 = F[2], f3 = F[3], f4 = F[4], f5 = F[5], f6 = F[6], f7 = F[7], f8 = F[8];
-  let n0 = (f4 * f8 - f5 * f7) * N0 + (f5 * f6 - f3 * f8) * N1 + (f3 * f7 - f4 * f6) * N2;
-  let n1 = (f2 * f7 - f1 * f8) * N0 + (f0 * f8 - f2 * f6) * N1 + (f1 * f6 - f0 * f7) * N2;
-  let n2 = (f1 * f5 - f2 * f4) * N0 + (f2 * f3 - f0 * f5) * N1 + (f0 * f4 - f1 * f3) * N2;
-  const growth = Math.sqrt(n0 * n0 + n1 * n1 + n2 * n2);
-  if (growth > 0) n0 /= growth, n1 /= growth, n2 /= growth;
-  const area = rest * Math.min(growth, aero.maxAreaRatio);
-  const r0 = wind[0] - v0, r1 = wind[1] - v1, r2 = wind[2] - v2;
-  const along = r0 * n0 + r1 * n1 + r2 * n2;
-  const sign = along < 0 ? -1 : 1;
-  face[0] = sign * n0, face[1] = sign * n1, face[2] = sign * n2;
-  across[0] = along * n0, across[1] = along * n1, across[2] = along * n2;
-  tangent[0] = r0 - across[0], tangent[1] = r1 - across[1], tangent[2] = r2 - across[2];
-  pressed[0] = along * along * face[0], pressed[1] = along * along * face[1], pressed[2] = along * along * face[2];
-  terms(aero, 0.5 * aero.airDensity * area, area, wind, r0, r1, r2, face, across, pressed, tangent, out);
-}
-
-/**
  * The force on the patches of a point that has several directions, see gaussian_swaying/wind/patches.py.
  * @param {Aero} aero @param {Float64Array} wind @param {number} v0 @param {number} v1 @param {number} v2 @param {Float64Array} F
  * @param {Float64Array} tensor six numbers of the sum of A N N^T for each point @param {number} at index of those of the point

@@ -1,6 +1,6 @@
 // The solver by the package's own kernels in WebAssembly, which gaussian_swaying/viewer/live_web/kernels.py writes into the block.
-import { largestSquare } from "./laws.js";
-import { Solver, WIDE } from "./solver.js";
+import { tug } from "./body.js";
+import { LOOKS, Solver, WIDE } from "./solver.js";
 
 const ROW = 8; // numbers of a node in the kernels' memory: displacement and velocity, four each
 const TIMES = 4; // numbers of a substep in the table of times, of which the first row is that before
@@ -11,6 +11,7 @@ export class KernelSolver extends Solver {
     super(block);
     const { image, fusedCode, plainCode } = block.arrays;
     const { start, places } = block.head.kernels;
+    if (!globalThis.WebAssembly?.validate(plainCode)) throw new Error("this browser has no WebAssembly with SIMD");
     const memory = new WebAssembly.Memory({ initial: Math.ceil((start + image.length) / 65536) });
     const stack = new WebAssembly.Global({ value: "i32", mutable: true }, start);
     const env = { __linear_memory: memory, __stack_pointer: stack, fmaxf: Math.max, sinf: Math.sin, cosf: Math.cos };
@@ -27,7 +28,6 @@ export class KernelSolver extends Solver {
     this.moduli = this.tables.material.slice(this.points, 3 * this.points);
     this.curving = this.tables.curving?.slice(); // the square of which is a stiffness
     this.stiffened = 1;
-    this.inside = false; // whether the state is that in the memory
   }
 
   /** The state to or from the memory of the kernels. */
@@ -45,37 +45,41 @@ export class KernelSolver extends Solver {
   /** See Solver. */
   roll(dt, steps) {
     this.exchange(false);
-    this.inside = true;
-    const far = super.roll(dt, steps);
-    this.inside = false;
+    let farthest = 0;
+    const far = () => {
+      this.measure();
+      farthest = Math.max(farthest, this.far(dt));
+    };
+    const every = Math.max(1, Math.ceil(steps / LOOKS));
+    for (let k = 0; k < steps; k++) {
+      if (k > 0 && k % every === 0) far();
+      this.step(dt);
+    }
+    far();
     this.exchange(true);
-    return far;
+    return farthest;
   }
 
-  /** See Solver; within a frame only what decides about the Courant number. */
+  /** See Solver. */
   look() {
-    const { tables, seen, stiffness, head, inside } = this;
-    if (seen.time === this.time && seen.stiffness === stiffness) return;
-    this.exchange(inside);
-    const bending = Math.sqrt(stiffness * head.bending); // see Formulation.with_bending
-    if (!tables.fastest) { // several laws
-      super.look();
-      this.seen.wave = Math.hypot(this.seen.wave, bending);
-      return;
+    this.exchange(false);
+    this.measure();
+    this.kernels.read();
+    const { velocity } = this.tables;
+    for (let p = 0; p < this.points; p++) {
+      const at = 3 * this.a.order[p];
+      this.speed[p] = Math.hypot(velocity[at], velocity[at + 1], velocity[at + 2]);
     }
-    this.stiffen();
-    tables.fastest[0] = 0;
+  }
+
+  /** What decides about the Courant number; stress is the stiffness times that in the file, and so is the square of the wave. */
+  measure() {
+    const { stiffness, head } = this;
+    const { fastest } = this.tables;
+    fastest.fill(0);
     this.kernels.look();
-    let stretched = 1;
-    if (!inside || head.viscous > 0) this.kernels.read();
-    for (let p = 0; !inside && p < this.points; p++) {
-      const [at, { velocity: v }] = [3 * this.a.order[p], tables];
-      this.speed[p] = Math.sqrt(v[at] * v[at] + v[at + 1] * v[at + 1] + v[at + 2] * v[at + 2]);
-    }
-    for (let p = 0; head.viscous > 0 && p < this.points; p++)
-      stretched = Math.max(stretched, largestSquare(tables.F.subarray(9 * p, 9 * p + 9)));
-    const wave = Math.hypot(tables.fastest[0], bending);
-    this.seen = { time: this.time, stiffness, wave, viscous: head.viscous * stretched };
+    const wave = Math.sqrt(stiffness * (fastest[0] ** 2 + head.bending)); // see Formulation.with_bending
+    this.seen = { time: this.time, stiffness, wave, viscous: head.viscous * Math.max(fastest[1] ** 2, 1) };
   }
 
   stiffen() {
@@ -85,10 +89,9 @@ export class KernelSolver extends Solver {
     this.tables.curving?.set(this.curving.map((x) => x * Math.sqrt(this.stiffness)));
   }
 
-  /** See Solver. */
-  step(dt, looked) {
+  /** One substep of `dt` [s]. */
+  step(dt) {
     const { tables, kernels, head } = this;
-    if (looked) this.look();
     this.stiffen();
     const kick = this.kick(dt);
     tables.schedule.set([kick, dt, Math.exp(-head.damping * kick)], TIMES);
@@ -99,9 +102,7 @@ export class KernelSolver extends Solver {
       tables.winds.set(this.blown);
     }
     if (this.pull) {
-      this.exchange(true);
-      tables.force.fill(0);
-      this.pulls(this.pull);
+      this.tug(this.pull);
       kernels.pulled();
     } else {
       kernels.free();
@@ -110,8 +111,25 @@ export class KernelSolver extends Solver {
     this.substep = dt;
   }
 
-  /** See Solver. */
-  push(p, force, damping) {
-    this.tables.force.set([...force.subarray(0, 3), damping], 4 * this.a.order[p]);
+  /** A spring and a damper to where the visitor pulls, on the points that are held. */
+  tug(/** @type {import("./body.js").Pull} */ pull) {
+    const { position, velocity, force } = this.tables;
+    this.kernels.read();
+    force.fill(0);
+    for (let p = 0; p < this.points; p++) {
+      if (pull.held[p] === 0) continue;
+      const at = this.a.order[p];
+      const [place, speed] = [position, velocity].map((field) => field.subarray(3 * at, 3 * at + 3));
+      const own = force.subarray(4 * at, 4 * at + 4);
+      own[3] = tug(pull, p, place, speed, own);
+    }
+  }
+
+  /** Places of all points [m]. */
+  positions(to) {
+    this.exchange(false);
+    this.kernels.read();
+    for (let p = 0; p < this.points; p++)
+      for (let m = 0; m < 3; m++) to[3 * p + m] = this.tables.position[3 * this.a.order[p] + m];
   }
 }

@@ -38,6 +38,18 @@ export async function sway(read, tell) {
   const say = (/** @type {any} */ message, /** @type {Transferable[]} */ given = []) => worker.postMessage(message, given);
   const answers = []; // promises of tests, see `advance`
 
+  const start = new Promise((resolve, reject) => {
+    const first = (/** @type {MessageEvent} */ event) => {
+      if (event.data.kind !== "failed") return resolve(null);
+      event.stopImmediatePropagation();
+      worker.terminate();
+      reject(new Error(event.data.why));
+    };
+    worker.addEventListener("message", first, { once: true });
+    worker.onerror = () => reject(new Error("the solver did not start"));
+  });
+  start.catch(() => {}); // awaited at the end
+
   worker.onmessage = ({ data }) => {
     if (data.kind === "state") {
       if (data.motion !== state.motion) playback.clear();
@@ -52,10 +64,6 @@ export async function sway(read, tell) {
       state.failed = data.why;
       setPlaying(false);
     }
-    explain();
-  };
-  worker.onerror = () => {
-    state.failed = "the solver did not start";
     explain();
   };
   const block = await read("solver");
@@ -333,4 +341,5 @@ export async function sway(read, tell) {
       return view.positions();
     },
   };
+  await start;
 }

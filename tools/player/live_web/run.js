@@ -1,9 +1,9 @@
-// Runs the built worker without a browser: node run.js WORKER BLOCK STATE MESSAGES [plain]
+// Runs the built worker without a browser: node run.js WORKER BLOCK STATE MESSAGES
 // It gets the block and the messages (JSON), writes the last state to STATE (float32), and prints all other answers (JSON).
 import { readFileSync, writeFileSync } from "node:fs";
 import { runInThisContext } from "node:vm";
 
-const [worker, block, state, messages, plain] = process.argv.slice(2);
+const [worker, block, state, messages] = process.argv.slice(2);
 const answers = [];
 let last = new Float32Array();
 
@@ -14,7 +14,7 @@ globalThis.self = {
   },
 };
 runInThisContext(readFileSync(worker, "utf8"));
-for (const data of [{ kind: "load", bytes: new Uint8Array(readFileSync(block)), plain: plain === "plain" }, ...JSON.parse(messages)]) {
+for (const data of [{ kind: "load", bytes: new Uint8Array(readFileSync(block)) }, ...JSON.parse(messages)]) {
   const [before, known] = [process.cpuUsage(), answers.length];
   await globalThis.self.onmessage({ data });
   const { user, system } = process.cpuUsage(before);

@@ -1,5 +1,5 @@
-// A substep of solver.js in compute shaders, in single precision: the functions of the same names there, in laws.js, matrices.js and
-// aero.js are the definition, and those of touch.wgsl for contact. `particles` works on a point, `spread` on three nodes of a cell, `accelerate` on a node; none of them adds to
+// A substep in compute shaders, in single precision; the definitions are gaussian_swaying/mpm/total.py, mpm/laws and wind/force.py.
+// touch.wgsl has contact. `particles` works on a point, `spread` on three nodes of a cell, `accelerate` on a node; none of them adds to
 // what another one writes, so that the order of all sums is the same every time.
 
 struct Point {
@@ -10,16 +10,14 @@ struct Point {
   lower: vec3f, unused: f32, // yy, yz, zz
 }
 
-struct Node { rest: vec3f, inverse: f32, damping: f32, held: u32, first: u32, last: u32 }
-struct Plane { point: vec3f, friction: f32, normal: vec3f, kind: u32 }
+struct Node { inverse: f32, damping: f32, held: u32, first: u32, last: u32 }
 struct Share { node: u32, weight: f32 }
 
-/** What differs from substep to substep. `planes` and `obstacles` have a bit for each one that acts. */
+/** What differs from substep to substep. `obstacles` has a bit for each one that acts. */
 struct Step {
   wind: vec3f, kick: f32,
   aim: vec3f, dt: f32,
-  stiffness: f32, pulled: u32, planes: u32, slot: u32,
-  obstacles: u32,
+  stiffness: f32, pulled: u32, obstacles: u32, slot: u32,
 }
 
 @group(0) @binding(0) var<storage, read> points: array<Point>;
@@ -28,12 +26,11 @@ struct Step {
 @group(0) @binding(3) var<storage, read> held: array<vec4f>; // where a point is pulled to, relative to the aim and its rest, and its share
 @group(0) @binding(4) var<storage, read_write> displacement: array<vec4f>;
 @group(0) @binding(5) var<storage, read_write> velocity: array<vec4f>;
-@group(0) @binding(6) var<storage, read_write> stresses: array<vec4f>; // of a point: three columns with a force, and mass times place with a resistance
+@group(0) @binding(6) var<storage, read_write> stresses: array<vec4f>; // of a point: three columns with a force, and a resistance
 @group(0) @binding(7) var<storage, read> cellStart: array<u32>;
-@group(0) @binding(8) var<storage, read_write> sums: array<vec4f>; // of a node of a cell: force and resistance, and mass times place
+@group(0) @binding(8) var<storage, read_write> sums: array<vec4f>; // of a node of a cell: force and resistance
 @group(0) @binding(9) var<storage, read> nodes: array<Node>;
 @group(0) @binding(10) var<storage, read> entries: array<u32>; // of `sums`, node by node
-@group(0) @binding(11) var<storage, read> planes: array<Plane>;
 @group(0) @binding(12) var<storage, read> rows: array<Share>;
 @group(0) @binding(13) var<storage, read_write> rates: array<vec4f>;
 @group(0) @binding(14) var<storage, read> affected: array<u32>;
@@ -47,7 +44,6 @@ override SPREAD: u32; // rows of three nodes of all cells
 override NODES: u32;
 override ROWS: u32;
 override AFFECTED: u32;
-override PLANES: u32;
 override OBSTACLES: u32;
 override INVERSE: f32; // 1/dx
 override GRAVITY_X: f32;
@@ -73,8 +69,6 @@ const HENCKY = 2u;
 const PAPER = 0u;
 const LINEAR = 2u;
 const CROSS_FLOW = 3u;
-const STICKY = 0u;
-const SEPARATE = 2u;
 
 // ---- weights
 
@@ -347,7 +341,7 @@ fn waveModulus(law: u32, F: mat3x3f, mu: f32, lam: f32) -> f32 {
 
 // ---- wind
 
-/** Force [N] and resistance [kg/s] of the wind on the patches of a point; see `onGroup` and, for one patch, `onPatch`. */
+/** Force [N] and resistance [kg/s] of the wind on the patches of a point; see `onGroup` in aero.js. */
 fn blow(point: Point, F: mat3x3f, moving: vec3f) -> vec4f {
   let C = cofactors(F);
   let T = mat3x3f(point.upper, vec3f(point.upper.y, point.lower.xy), vec3f(point.upper.z, point.lower.yz));
@@ -402,7 +396,7 @@ fn particles(@builtin(global_invocation_id) id: vec3u) {
   stresses[4 * p] = vec4f(P[0], b.x);
   stresses[4 * p + 1] = vec4f(P[1], b.y);
   stresses[4 * p + 2] = vec4f(P[2], b.z);
-  stresses[4 * p + 3] = vec4f(point.mass * at.place, b.w);
+  stresses[4 * p + 3] = vec4f(0, 0, 0, b.w);
 }
 
 @compute @workgroup_size(64)
@@ -416,7 +410,6 @@ fn spread(@builtin(global_invocation_id) id: vec3u) {
   let scale = select(vec2f(0.5), vec2f(-1), row == vec2u(1));
   let offset = select(vec2f(), vec2f(0.75), row == vec2u(1));
   var sum = array<vec4f, 3>();
-  var shift = array<vec3f, 3>();
   for (var p = cellStart[cell]; p < cellStart[cell + 1]; p++) {
     let f = points[p].fraction;
     let far = f.xy - middle;
@@ -427,38 +420,16 @@ fn spread(@builtin(global_invocation_id) id: vec3u) {
     let x = stresses[4 * p];
     let y = stresses[4 * p + 1];
     let z = stresses[4 * p + 2];
-    let last = stresses[4 * p + 3];
     let whole = w.x * w.y;
-    let own = vec4f((g.x * w.y) * x.xyz + (w.x * g.y) * y.xyz + whole * vec3f(x.w, y.w, z.w), whole * last.w);
+    let own = vec4f((g.x * w.y) * x.xyz + (w.x * g.y) * y.xyz + whole * vec3f(x.w, y.w, z.w), whole * stresses[4 * p + 3].w);
     let along = vec4f(whole * z.xyz, 0);
     sum[0] += wz.x * own + gz.x * along;
     sum[1] += wz.y * own + gz.y * along;
     sum[2] += wz.z * own + gz.z * along;
-    if (PLANES > 0) {
-      shift[0] += (whole * wz.x) * last.xyz;
-      shift[1] += (whole * wz.y) * last.xyz;
-      shift[2] += (whole * wz.z) * last.xyz;
-    }
   }
   for (var l = 0u; l < 3; l++) {
-    if (PLANES == 0) {
-      sums[3 * k + l] = sum[l];
-    } else {
-      sums[6 * k + 2 * l] = sum[l];
-      sums[6 * k + 2 * l + 1] = vec4f(shift[l], 0);
-    }
+    sums[3 * k + l] = sum[l];
   }
-}
-
-fn stop(plane: Plane, place: vec3f, V: vec3f) -> vec3f {
-  let n = plane.normal;
-  if (dot(place - plane.point, n) > 0) { return V; }
-  if (plane.kind == STICKY) { return vec3f(); }
-  let along = dot(V, n);
-  let removed = select(along, min(along, 0.0), plane.kind == SEPARATE);
-  var t = V - along * n;
-  if (plane.friction > 0) { t *= max(0.0, 1.0 - plane.friction * abs(removed) / max(length(t), 1e-30)); }
-  return t + (along - removed) * n;
 }
 
 @compute @workgroup_size(64)
@@ -467,7 +438,7 @@ fn accelerate(@builtin(global_invocation_id) id: vec3u) {
   if (k >= NODES) { return; }
   let node = nodes[k];
   var force = vec4f();
-  for (var e = node.first; e < node.last; e++) { force += sums[select(entries[e], 2 * entries[e], PLANES > 0)]; }
+  for (var e = node.first; e < node.last; e++) { force += sums[entries[e]]; }
   let decay = exp(-now.kick * (DAMPING + node.damping));
   let kick = now.kick / (1.0 + now.kick * force.w * node.inverse);
   let V = decay * (velocity[k].xyz + kick * (force.xyz * node.inverse + vec3f(GRAVITY_X, GRAVITY_Y, GRAVITY_Z)));
@@ -485,16 +456,9 @@ fn finish(@builtin(global_invocation_id) id: vec3u) {
   if (k < NODES) { end(k, nodes[k], velocity[k].xyz); }
 }
 
-/** Planes and pins of nodes, and the motion. */
+/** Pins of nodes, and the motion. */
 fn end(k: u32, node: Node, free: vec3f) {
   var V = free;
-  if (PLANES > 0) {
-    var shift = vec3f();
-    for (var e = node.first; e < node.last; e++) { shift += sums[2 * entries[e] + 1].xyz; }
-    for (var p = 0u; p < PLANES; p++) {
-      if ((now.planes & (1u << p)) != 0) { V = stop(planes[p], node.rest + shift * node.inverse, V); }
-    }
-  }
   if (node.held > 0) { V = vec3f(); }
   velocity[k] = vec4f(V, 0);
   displacement[k] += vec4f(now.dt * V, 0);

@@ -1,4 +1,4 @@
-// Contact of the samples of the surface with obstacles, as contact.js has it. `meet` finds what acts, `weigh` how much it moves the nodes,
+// Contact of the samples of the surface with obstacles, as in gaussian_swaying/mpm/contact.py, without pairs. `meet` finds what acts, `weigh` how much it moves the nodes,
 // and `resolve` iterates in one group, which waits for itself. It follows substep.wgsl, which has what it shares.
 
 struct Obstacle { center: vec3f, kind: u32, first: vec4f, x: vec3f, friction: f32, y: vec3f, gap: f32, z: vec3f, unused: f32 }

@@ -1,7 +1,7 @@
 // The solver in compute shaders, where the browser has WebGPU. It computes frame by frame: the state at the start of each is uploaded, and
-// that at its end read back, so that all else is as in solver.js and another solver can go on where this one stops.
+// that at its end read back, so that another solver can go on where this one stops.
 import { QUICK, STRONGEST } from "./body.js";
-import { LOOKS, Solver, WIDE } from "./solver.js";
+import { LOOKS, Solver } from "./solver.js";
 import substep from "./substep.wgsl";
 import touch from "./touch.wgsl";
 
@@ -14,7 +14,7 @@ const SOFTWARE = /swiftshader|llvmpipe|lavapipe|basic render|warp/i;
 /** Buffers by their number in the shader; the second says whether it writes to them. @type {Record<string, [number, boolean]>} */
 const BUFFERS = {
   points: [0, false], cellNodes: [1, false], vectors: [2, false], held: [3, false], displacement: [4, true], velocity: [5, true],
-  stresses: [6, true], cellStart: [7, false], sums: [8, true], nodes: [9, false], entries: [10, false], planes: [11, false],
+  stresses: [6, true], cellStart: [7, false], sums: [8, true], nodes: [9, false], entries: [10, false],
   rows: [12, false], rates: [13, true], affected: [14, false], push: [15, false], speeds: [16, true], fastest: [17, true],
   places: [18, false], reach: [19, false], obstacles: [20, false], readers: [21, false], touches: [22, true], impulses: [23, true],
   loads: [24, true],
@@ -24,11 +24,11 @@ const BUFFERS = {
 const PASSES = {
   particles: "points cellNodes vectors held displacement velocity stresses",
   spread: "points stresses cellStart sums",
-  accelerate: "displacement velocity sums nodes entries planes",
+  accelerate: "displacement velocity sums nodes entries",
   meet: "displacement velocity places reach obstacles touches impulses",
   weigh: "nodes reach readers impulses loads",
   resolve: "velocity nodes reach readers touches impulses loads",
-  finish: "displacement velocity sums nodes entries planes",
+  finish: "displacement velocity nodes",
   rate: "velocity rows rates",
   hold: "displacement velocity rates affected push",
   look: "points cellNodes displacement velocity speeds fastest",
@@ -36,9 +36,10 @@ const PASSES = {
 
 const SUBSTEP = "particles spread accelerate meet weigh resolve finish rate hold".split(" ");
 
-const PLANE_KINDS = ["sticky", "slip", "separate"];
 const OBSTACLE_KINDS = ["half_space", "capsule", "box"];
-const MOST = 32; // planes or obstacles
+const MOST = 32; // obstacles
+
+/** @typedef {import("./kernels.js").KernelSolver} KernelSolver */
 
 /** Says that WebGPU cannot be used, or no longer; its message follows "as". */
 export class NoWebGPU extends Error {}
@@ -81,16 +82,17 @@ function tensorOf({ a, head }, p) {
 /** Why a scene is not simulated in compute shaders; null if it is. @returns {string | null} */
 export function uncovered({ head, arrays }) {
   if (head.bending > 0) return "the sheet bends by itself";
-  if (Math.max(head.obstacles.length, head.planes.length) > MOST) return `the scene has more than ${MOST} planes or obstacles`;
+  if (head.obstacles.length > MOST) return `the scene has more than ${MOST} obstacles`;
   if (9 * (arrays.cellStart.length - 1) > GROUP * MOST_GROUPS) return "the scene has too many points";
   return null;
 }
 
 /**
- * @param {{head: any, arrays: Record<string, any>}} block @param {boolean} byHand also on an adapter that is software
+ * @param {{head: any, arrays: Record<string, any>}} block @param {KernelSolver} processor @param {boolean} byHand also on an adapter
+ *   that is software
  * @returns {Promise<GpuSolver>} Rejects with NoWebGPU.
  */
-export async function openGpu(block, byHand) {
+export async function openGpu(block, processor, byHand) {
   const why = uncovered(block);
   if (why) throw new NoWebGPU(why);
   const gpu = globalThis.navigator?.gpu;
@@ -104,7 +106,7 @@ export async function openGpu(block, byHand) {
     device = await adapter.requestDevice();
     device.pushErrorScope("out-of-memory");
     device.pushErrorScope("validation");
-    const solver = new GpuSolver(block, device);
+    const solver = new GpuSolver(block, processor, device);
     await solver.compile();
     const errors = [await device.popErrorScope(), await device.popErrorScope()];
     for (const error of errors) if (error) throw error;
@@ -116,19 +118,20 @@ export async function openGpu(block, byHand) {
 }
 
 export class GpuSolver extends Solver {
-  /** @param {{head: any, arrays: Record<string, any>}} block @param {any} device GPUDevice */
-  constructor(block, device) {
+  /**
+   * @param {{head: any, arrays: Record<string, any>}} block @param {KernelSolver} processor knows where points are
+   * @param {any} device GPUDevice
+   */
+  constructor(block, processor, device) {
     super(block);
+    this.processor = processor;
     this.device = device;
     /** Why the device cannot go on. @type {string | null} */
     this.broken = null;
     device.lost.then(({ message }) => (this.broken ??= message || "its device was lost"));
     device.onuncapturederror = ({ error }) => (this.broken ??= error.message);
     const { nodes, points, cells } = this;
-    this.displacement = new Float32Array(WIDE * nodes);
-    this.velocity = new Float32Array(WIDE * nodes);
-    this.before = { displacement: this.displacement.slice(), velocity: this.velocity.slice() };
-    const samples = this.contact?.count ?? 0;
+    const samples = this.a.sampleHalf.length;
     this.counts = {
       particles: points, spread: 9 * cells, accelerate: nodes - 1, meet: samples, weigh: samples && nodes - 1, resolve: samples && 1,
       finish: samples && nodes - 1, rate: this.head.rows, hold: this.a.affected.length, look: points,
@@ -136,17 +139,16 @@ export class GpuSolver extends Solver {
     /** @type {any} what the last pull uploaded */
     this.uploaded = null;
     this.fill();
-    this.reset();
   }
 
   /** Makes the buffers, with all that is constant. */
   fill() {
     const { a, head, nodes, points, cells, device } = this;
-    const record = { points: new Float32Array(20 * points), nodes: new Float32Array(8 * nodes), planes: new Float32Array(8 * head.planes.length) };
-    const whole = { points: new Uint32Array(record.points.buffer), nodes: new Uint32Array(record.nodes.buffer), planes: new Uint32Array(record.planes.buffer) };
+    const record = { points: new Float32Array(20 * points), nodes: new Float32Array(5 * nodes) };
+    const whole = { points: new Uint32Array(record.points.buffer), nodes: new Uint32Array(record.nodes.buffer) };
     const vectors = areaVectors(this);
     const table = new Float32Array(4 * vectors.reduce((sum, own) => sum + own.length / 3, 0));
-    let row = 0;
+    let [row, cell] = [0, 0];
     for (let p = 0; p < points; p++) {
       const at = 20 * p;
       const tensor = tensorOf(this, p);
@@ -155,7 +157,8 @@ export class GpuSolver extends Solver {
       record.points.set([a.volume[p], a.mass[p], a.mu[p], a.lam[p]], at + 4);
       record.points[at + 9] = own.length ? a.area[p] : 0;
       record.points.set([tensor[0], tensor[1], tensor[2], tensor[0] + tensor[3] + tensor[5], tensor[3], tensor[4], tensor[5]], at + 12);
-      whole.points[at + 3] = this.cell[p];
+      while (p >= a.cellStart[cell + 1]) cell++;
+      whole.points[at + 3] = cell;
       whole.points[at + 8] = a.law[p];
       whole.points[at + 10] = row;
       for (let k = 0; k < own.length; k += 3) table.set(own.slice(k, k + 3), 4 * row++);
@@ -163,15 +166,9 @@ export class GpuSolver extends Solver {
     }
     const { ends, entries } = grouped(a.cellNodes, nodes);
     for (let k = 0; k < nodes; k++) {
-      const at = 8 * k;
-      if (a.nodeRest.length) record.nodes.set(a.nodeRest.subarray(3 * k, 3 * k + 3), at);
-      record.nodes.set([a.inverseMass[k], a.nodeDamping[k] ?? 0], at + 3);
-      whole.nodes.set([a.held[k] ?? 0, ends[k], ends[k + 1]], at + 5);
+      record.nodes.set([a.inverseMass[k], a.nodeDamping[k] ?? 0], 5 * k);
+      whole.nodes.set([a.held[k] ?? 0, ends[k], ends[k + 1]], 5 * k + 2);
     }
-    head.planes.forEach(({ point, normal, kind, friction }, k) => {
-      record.planes.set([...point, friction, ...normal], 8 * k);
-      whole.planes[8 * k + 7] = PLANE_KINDS.indexOf(kind);
-    });
     const obstacles = new Float32Array(20 * head.obstacles.length);
     head.obstacles.forEach(({ center, kind, numbers: n, friction, gap }, k) => {
       obstacles.set(center, 20 * k);
@@ -199,10 +196,9 @@ export class GpuSolver extends Solver {
     make("velocity", 16 * nodes);
     make("stresses", 64 * points);
     make("cellStart", Uint32Array.from(a.cellStart));
-    make("sums", 27 * 16 * cells * (head.planes.length ? 2 : 1));
+    make("sums", 27 * 16 * cells);
     make("nodes", record.nodes);
     make("entries", entries);
-    make("planes", record.planes);
     make("rows", shares(a.rowNode, a.rowWeight));
     make("rates", 16 * head.rows);
     make("affected", Uint32Array.from(a.affected));
@@ -229,7 +225,7 @@ export class GpuSolver extends Solver {
       if (type === "error") throw new Error(`${message} in line ${lineNum} of its shader`);
     const constants = {
       POINTS: this.points, SPREAD: counts.spread, NODES: counts.accelerate, ROWS: counts.rate, AFFECTED: counts.hold,
-      PLANES: head.planes.length, OBSTACLES: counts.meet && head.obstacles.length, SAMPLES: counts.meet, ITERATIONS: head.iterations,
+      OBSTACLES: counts.meet && head.obstacles.length, SAMPLES: counts.meet, ITERATIONS: head.iterations,
       DX: head.dx, INVERSE: 1 / head.dx, GRAVITY_X: head.gravity[0], GRAVITY_Y: head.gravity[1],
       GRAVITY_Z: head.gravity[2], DAMPING: head.damping, VISCOUS: head.viscous, WINDY: Number(!this.idle),
       DRAG: aero.drag, FRICTION: aero.friction, LIFT: aero.lift, AIR: aero.airDensity, AERO_LAW: aero.law,
@@ -273,6 +269,12 @@ export class GpuSolver extends Solver {
       [this.time, this.substep] = [time, substep]; // those of the displacements
       throw error;
     }
+  }
+
+  /** Places of all points [m]. */
+  positions(to) {
+    this.processor.displacement.set(this.displacement);
+    this.processor.positions(to);
   }
 
   /** The last measurement is there; the stress is the stiffness times that in the file, and so is the square of the wave. */
@@ -322,13 +324,12 @@ export class GpuSolver extends Solver {
           run("look", 4 * at);
         }
         if (k === steps) break;
-        const kick = this.substep > 0 ? Math.min(0.5 * (this.substep + dt), 2 * dt) : dt;
+        const kick = this.kick(dt);
         if (!this.idle) this.wind.blow(this.time, this.blown);
         numbers.set([...this.blown, kick, ...(pull?.target ?? [0, 0, 0]), dt, this.stiffness], at);
         whole[at + 9] = pull === null ? 0 : 1;
-        const acting = (/** @type {any[]} */ all) => all.reduce((bits, one, p) => bits | (this.acts(one) ? 1 << p : 0), 0);
-        whole[at + 10] = acting(head.planes);
-        whole[at + 12] = acting(head.obstacles);
+        const acts = ({ start, end }) => this.time + 1e-9 >= start && (end === null || this.time + 1e-9 < end);
+        whole[at + 10] = head.obstacles.reduce((bits, one, p) => bits | (acts(one) ? 1 << p : 0), 0);
         for (const name of SUBSTEP) run(name, 4 * at);
         this.time += dt;
         this.substep = dt;
@@ -353,7 +354,7 @@ export class GpuSolver extends Solver {
       const wave = Math.sqrt(this.stiffness * found.fastest[2 * k]);
       const viscous = head.viscous * Math.max(found.fastest[2 * k + 1], 1);
       this.seen = { time: this.time, stiffness: this.stiffness, wave, viscous };
-      farthest = Math.max(farthest, Math.sqrt(dt * dt + 2 * viscous * dt) * wave);
+      farthest = Math.max(farthest, this.far(dt));
     }
     return this.displacement.every(Number.isFinite) ? farthest : NaN;
   }

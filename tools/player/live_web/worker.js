@@ -2,7 +2,6 @@
 import { readBlock } from "./block.js";
 import { KernelSolver } from "./kernels.js";
 import { ModalSolver } from "./modal.js";
-import { Solver } from "./solver.js";
 import { GpuSolver, NoWebGPU, openGpu } from "./webgpu.js";
 
 const BEHIND = 0.25; // s that it may be late before it stops trying to catch up
@@ -15,9 +14,10 @@ const BREATH = 4; // ms between frames, in which it hears what the page says
 
 /** @type {any} */
 let solver;
+/** The one that needs no graphics card. @type {any} */
+let processor;
 /** @type {{head: any, arrays: Record<string, any>}} */
 let block;
-let plain = false; // without WebAssembly
 let wanted = ""; // "auto", "webgpu" or "worker": where the motion is computed
 /** Speed with WebGPU where it was too slow, so that the processor is tried. @type {number | null} */
 let slow = null;
@@ -35,19 +35,6 @@ let next;
 
 const post = (/** @type {any} */ message, /** @type {Transferable[]} */ moved = []) => self.postMessage(message, moved);
 
-/** The fastest solver on the processor that this browser has, or with `plain` that in JavaScript. */
-function made() {
-  if (block.head.modes) return new ModalSolver(block);
-  if (!plain && block.head.kernels) {
-    try {
-      return new KernelSolver(block);
-    } catch (error) {
-      if (block.head.bending > 0) throw error; // a browser without WebAssembly for four numbers at a time
-    }
-  }
-  return new Solver(block);
-}
-
 const queue = (/** @type {() => any} */ task) => (chain = chain.then(task).catch(({ message }) => post({ kind: "failed", why: message })));
 
 /** Says what computes, and why it is not WebGPU, once that is known. @param {string | null} why */
@@ -56,7 +43,7 @@ function tell(why = null) {
   post({ kind: "solver", name, why });
 }
 
-/** Another solver goes on with the motion. @param {Solver} next @param {string | null} why */
+/** Another solver goes on with the motion. @param {any} next @param {string | null} why */
 function takeOver(next, why = null) {
   for (const name of ["displacement", "velocity"]) next[name].set(solver[name]);
   const { time, substep, stiffness, hurried, pull, wind, first } = solver;
@@ -70,17 +57,17 @@ function takeOver(next, why = null) {
 /** Computes as is wanted, as far as possible; until WebGPU is there, the processor does. */
 async function choose() {
   if (wanted === "worker") {
-    if (solver instanceof GpuSolver) takeOver(made());
+    if (solver instanceof GpuSolver) takeOver(processor);
     return;
   }
   if (solver instanceof GpuSolver) return;
   if (solver instanceof ModalSolver) return tell("the object sways by modes");
   try {
-    const found = await openGpu(block, wanted === "webgpu");
+    const found = await openGpu(block, processor, wanted === "webgpu");
     queue(() => {
       if (wanted === "worker" || solver instanceof GpuSolver) return found.device.destroy();
       takeOver(found);
-      found.device.lost.then(() => queue(() => solver === found && takeOver(made(), found.broken)));
+      found.device.lost.then(() => queue(() => solver === found && takeOver(processor, found.broken)));
     });
   } catch (error) {
     tell(/** @type {Error} */ (error).message);
@@ -93,7 +80,7 @@ async function forward() {
     return await solver.advance();
   } catch (error) {
     if (!(error instanceof NoWebGPU)) throw error;
-    takeOver(made(), error.message);
+    takeOver(processor, error.message);
     return solver.advance();
   }
 }
@@ -124,7 +111,7 @@ function hurry() {
   } else if (late && !settled && wanted === "auto" && found.wall > FULL * WINDOW) {
     if (solver instanceof GpuSolver) {
       slow = found.rate;
-      takeOver(made(), "it is too slow here");
+      takeOver(processor, "it is too slow here");
     } else if (slow !== null) {
       settled = true;
       if (found.rate < slow) choose();
@@ -169,8 +156,7 @@ function restart() {
 const does = {
   load(given) {
     block = readBlock(given.bytes);
-    plain = !!given.plain;
-    solver = made();
+    solver = processor = block.head.modes ? new ModalSolver(block) : new KernelSolver(block);
     show();
     tell();
   },
