@@ -183,7 +183,6 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
         "obstacles": obstacles,
         "iterations": bound.contact.iterations if bound.contact is not None else 0,
         "rows": rows,
-        "grouped": force.sums is not None,
         "aero": _aero(force),
     }
     kernels, more = pack_kernels(bound, None if head["idle"] else force)
@@ -274,19 +273,23 @@ def _aero(force: WindForce) -> dict[str, Any]:
 
 
 def _wind_arrays(force: WindForce, order: Tensor) -> dict[str, Tensor]:
-    """The patches of each point: area vectors and the sum of A N N^T, or a unit normal and an area."""
+    """The patches of each point: area vectors and the sum of A N N^T."""
     sums, area = force.sums, force.area[order]
+    upper = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
     if sums is None:
-        return {"area": area, "patch": torch.cat([force.normal[order], area[:, None]], 1)}
+        normal, own = force.normal[order], area > 0
+        vector = area[:, None] * normal
+        tensor = vector[:, upper[0]] * normal[:, upper[1]]
+        ends = torch.nn.functional.pad(own.cumsum(0), (1, 0))
+        return {"area": area, "tensor": tensor, "firstVector": ends, "vectors": vector[own]}
     count = sums.point.bincount(minlength=len(order))
     first = (count.cumsum(0) - count)[order]
     own = torch.repeat_interleave(torch.arange(len(order)), count[order])
     ends = count[order].cumsum(0)
     within = torch.arange(len(own)) - (ends - count[order])[own]
-    upper = sums.tensor[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     return {
         "area": area,
-        "tensor": upper[order],
+        "tensor": sums.tensor[order][:, upper[0], upper[1]],
         "firstVector": torch.cat([ends.new_zeros(1), ends]),
         "vectors": sums.vector[first[own] + within],
     }

@@ -1,4 +1,4 @@
-// What both solvers have: what is simulated, its wind, and the pull of the visitor.
+// What all solvers have: what is simulated, its wind, and the pull of the visitor.
 import { Wind } from "./wind.js";
 
 /** @typedef {{held: Float64Array, offset: Float64Array, target: Float64Array}} Pull See gaussian_swaying/viewer/pull.py. */

@@ -63,22 +63,6 @@ function shares(/** @type {ArrayLike<number>} */ nodes, /** @type {ArrayLike<num
   return both;
 }
 
-/** Area vectors of the patches of each point, three numbers each. @param {Solver} solver @returns {number[][]} */
-function areaVectors({ a, head, points }) {
-  return Array.from({ length: points }, (_, p) => {
-    if (head.grouped) return Array.from(a.vectors.subarray(3 * a.firstVector[p], 3 * a.firstVector[p + 1]));
-    const area = a.patch[4 * p + 3];
-    return area > 0 ? [0, 1, 2].map((m) => area * a.patch[4 * p + m]) : [];
-  });
-}
-
-/** Six numbers of the sum of A N N^T of a point. @param {Solver} solver @param {number} p @returns {number[]} */
-function tensorOf({ a, head }, p) {
-  if (head.grouped) return Array.from(a.tensor.subarray(6 * p, 6 * p + 6));
-  const [x, y, z, area] = a.patch.subarray(4 * p, 4 * p + 4);
-  return [x * x, x * y, x * z, y * y, y * z, z * z].map((square) => area * square);
-}
-
 /** Why a scene is not simulated in compute shaders; null if it is. @returns {string | null} */
 export function uncovered({ head, arrays }) {
   if (head.bending > 0) return "the sheet bends by itself";
@@ -146,23 +130,20 @@ export class GpuSolver extends Solver {
     const { a, head, nodes, points, cells, device } = this;
     const record = { points: new Float32Array(20 * points), nodes: new Float32Array(5 * nodes) };
     const whole = { points: new Uint32Array(record.points.buffer), nodes: new Uint32Array(record.nodes.buffer) };
-    const vectors = areaVectors(this);
-    const table = new Float32Array(4 * vectors.reduce((sum, own) => sum + own.length / 3, 0));
-    let [row, cell] = [0, 0];
+    const vectors = Float32Array.from({ length: (4 * a.vectors.length) / 3 }, (_, k) => (k % 4 < 3 ? a.vectors[3 * (k >> 2) + (k % 4)] : 0));
+    let cell = 0;
     for (let p = 0; p < points; p++) {
       const at = 20 * p;
-      const tensor = tensorOf(this, p);
-      const own = vectors[p];
+      const [xx, xy, xz, yy, yz, zz] = a.tensor.subarray(6 * p, 6 * p + 6);
+      const own = a.firstVector.subarray(p, p + 2);
       record.points.set(a.fraction.subarray(3 * p, 3 * p + 3), at);
       record.points.set([a.volume[p], a.mass[p], a.mu[p], a.lam[p]], at + 4);
-      record.points[at + 9] = own.length ? a.area[p] : 0;
-      record.points.set([tensor[0], tensor[1], tensor[2], tensor[0] + tensor[3] + tensor[5], tensor[3], tensor[4], tensor[5]], at + 12);
+      record.points[at + 9] = own[1] > own[0] ? a.area[p] : 0;
+      record.points.set([xx, xy, xz, xx + yy + zz, yy, yz, zz], at + 12);
       while (p >= a.cellStart[cell + 1]) cell++;
       whole.points[at + 3] = cell;
       whole.points[at + 8] = a.law[p];
-      whole.points[at + 10] = row;
-      for (let k = 0; k < own.length; k += 3) table.set(own.slice(k, k + 3), 4 * row++);
-      whole.points[at + 11] = row;
+      whole.points.set(own, at + 10);
     }
     const { ends, entries } = grouped(a.cellNodes, nodes);
     for (let k = 0; k < nodes; k++) {
@@ -190,7 +171,7 @@ export class GpuSolver extends Solver {
     };
     make("points", record.points);
     make("cellNodes", Uint32Array.from(a.cellNodes));
-    make("vectors", table);
+    make("vectors", vectors);
     make("held", 16 * points);
     make("displacement", 16 * nodes);
     make("velocity", 16 * nodes);
