@@ -1,8 +1,9 @@
 // The solver by the package's own kernels in WebAssembly, which gaussian_swaying/viewer/live_web/kernels.py writes into the block.
-import { tug } from "./body.js";
+import { QUICK, tug } from "./body.js";
 import { LOOKS, Solver, WIDE } from "./solver.js";
 
 const ROW = 8; // numbers of a node in the kernels' memory: displacement and velocity, four each
+const OLD = 1 / (16 * QUICK); // s, for which the force of a pull is used again, as reading all points takes as long as a substep
 const TIMES = 4; // numbers of a substep in the table of times, of which the first row is that before
 
 export class KernelSolver extends Solver {
@@ -28,6 +29,8 @@ export class KernelSolver extends Solver {
     this.moduli = this.tables.material.slice(this.points, 3 * this.points);
     this.curving = this.tables.curving?.slice(); // the square of which is a stiffness
     this.stiffened = 1;
+    /** The pull whose force is in the table, and since when. @type {{pull: any, time: number}} */
+    this.tugged = { pull: null, time: 0 };
   }
 
   /** The state to or from the memory of the kernels. */
@@ -102,7 +105,8 @@ export class KernelSolver extends Solver {
       tables.winds.set(this.blown);
     }
     if (this.pull) {
-      this.tug(this.pull);
+      const { pull, time } = this.tugged;
+      if (pull !== this.pull || this.time < time || this.time - time >= OLD) this.tug(this.pull);
       kernels.pulled();
     } else {
       kernels.free();
@@ -114,6 +118,7 @@ export class KernelSolver extends Solver {
   /** A spring and a damper to where the visitor pulls, on the points that are held. */
   tug(/** @type {import("./body.js").Pull} */ pull) {
     const { position, velocity, force } = this.tables;
+    this.tugged = { pull, time: this.time };
     this.kernels.read();
     force.fill(0);
     for (let p = 0; p < this.points; p++) {
