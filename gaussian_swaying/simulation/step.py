@@ -651,7 +651,11 @@ def stepper_of(model: Model) -> Stepper:
         model.shared["stepper"] = Stepper(model.method.like(model.solver), model)
     stepper: Stepper = model.shared["stepper"]
     if stepper.model is not model:
-        stepper.take(model, running=stepper.starts > 0)
+        try:
+            stepper.take(model, running=stepper.starts > 0)
+        except Exception:
+            model.shared.clear()  # it has half of the model
+            raise
     return stepper
 
 
@@ -668,12 +672,15 @@ def step(model: Model, state: State) -> State:
 
     Args:
         model: The model, such as ``simulation.model``.
-        state: The state now, of :func:`start` or of this function.
+        state: The state now, of :func:`start`, of this function, or of the simulation.
 
     Raises:
         SimulationDiverged: If no substep is stable.
     """
-    return stepper_of(model).advance(state)[0]
+    stepper = stepper_of(model)
+    if stepper.starts == 0:  # the state is that of another stepper
+        stepper.start()
+    return stepper.advance(state)[0]
 
 
 class Launched:

@@ -91,6 +91,19 @@ def test_a_model_is_advanced_and_drawn_by_functions():
     assert white.amin(-1)[0, 0] == 1.0
 
 
+def test_a_model_that_cannot_be_advanced_is_refused_each_time_and_others_go_on():
+    solver = MPMSolver(0.2, gravity=(0, 0, 0), substep=2e-3, boundaries=[PinnedRegion(POLE)])
+    model = _flag(solver=solver, hold=None).model
+    simulation = _flag(solver=solver, hold=None)
+    first = simulation.start()  # a state is that of any stepper
+    stiff, expected = model.at("material.E", 3e7), step(model, first)
+    assert torch.equal(expected.position, simulation.advance(first)[0].position)
+    for _ in range(2):
+        with value_error("substep"):
+            step(stiff, first)
+    assert torch.equal(step(model, first).position, expected.position)
+
+
 @pytest.mark.parametrize(("name", "value", "shift"), [("wind.flow", [0.0, 4.0, 0.0], 1e-3), ("material.E", 3e3, 1.0)])
 def test_a_frame_has_a_gradient(name, value, shift):
     solver = MPMSolver(0.2, gravity=(0, 0, 0), substep=2e-3, boundaries=[PinnedRegion(POLE)])
