@@ -235,6 +235,15 @@ SECTIONS["known.air"] = lambda: _known("air.md")
 # ---- wind.md, contact.md, validation.md
 
 
+table(
+    "speed.pages", "pages",
+    "page | Gaussians | points | film [MB] | .sway [MB] | error of a node [% of the size] | page that simulates [MB] "
+    "| Node.js [x real time] | with the longest substeps",
+    lambda run: f"{run.config} | {run.count:,} | {run.points:,} | {run.bytes / 1e6:.1f} | {run.bundle_bytes / 1e6:.1f} "
+    f"| {100 * run.error_of_size:.2g} | {run.page_bytes / 1e6:.1f} | {run.real_time:.2f} | {run.real_time_longest:.2f}",
+)  # fmt: skip
+
+
 def _wind(run: Run) -> str:
     ratios = " | ".join(f"{own['ratio']:.2f}" for name, own in run.winds.items() if name in WINDS)
     return f"{_on(run)} | `{run.formulation}` | {run.particles:,} | {run.winds['uniform']['median_ms']:.3g} | {ratios}"
