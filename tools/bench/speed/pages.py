@@ -16,7 +16,7 @@ from gaussian_swaying.viewer.live_web.block import pack_solver
 from gaussian_swaying.viewer.live_web.page import PAGE, write_live_web
 
 
-@study("pages", [{"config": "flag", "frames": 75}, {"config": "leaves", "frames": 75}])
+@study("pages", [{"config": "flag", "frames": 75}])
 def pages(config: str, frames: int, device: str) -> Row:
     """A run of a configuration, its film as a page and as a bundle, and the page that simulates it."""
     with tempfile.TemporaryDirectory() as name:
