@@ -3,7 +3,6 @@
 from ._live import Live as Live
 from .captures.capture import read_capture as read_capture
 from .evaluation.compare import compare_run as compare_run
-from .fitting.fit import fit as fit
 from .gaussians.cloud import GaussianCloud as GaussianCloud
 from .gaussians.formats import export_cloud as export_cloud
 from .gaussians.formats import read_gaussians as read_gaussians
@@ -12,6 +11,7 @@ from .gaussians.ply import write_ply as write_ply
 from .geometry.regions import Box as Box
 from .geometry.regions import Cylinder as Cylinder
 from .geometry.regions import Sphere as Sphere
+from .inverse.fit import fit as fit
 from .mpm.boundary import Boundary as Boundary
 from .mpm.contact import Contact as Contact
 from .mpm.forces import Force as Force

@@ -54,7 +54,7 @@ def read_transforms(path: Path) -> tuple[list[PosedImage], list[str], Path | Non
         data, where = load_transforms(file), f"`{file}`"
         listed, photos = _listed_splits(where, data), Photos(file.parent)
         for index, frame in enumerate(data["frames"]):
-            if "video_path" in frame:  # a film, see fitting.videos
+            if "video_path" in frame:  # a film, see inverse.videos
                 continue
             name = _file_path(where, index, frame)
             pose = read_pose(where, data, index)

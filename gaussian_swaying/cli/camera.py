@@ -68,8 +68,8 @@ def write_camera(options: argparse.Namespace) -> int:
     """Find the camera, write the files, and print how sure it is."""
     from PIL import Image
 
-    from gaussian_swaying.fitting.cameras import find_camera
     from gaussian_swaying.gaussians.formats import read_gaussians
+    from gaussian_swaying.inverse.cameras import find_camera
 
     if options.fov is not None and not 0 < options.fov < 180:
         raise ValueError(f"Expected `--fov` to be between 0 and 180 degrees, but got {options.fov:g}.")
@@ -101,7 +101,7 @@ def first_frame(film: Path) -> Tensor:
 
     if film.suffix.lower() in STILLS:
         return read_image(film)[..., :3].contiguous()
-    from gaussian_swaying.fitting.videos import frames_of, next_of
+    from gaussian_swaying.inverse.videos import frames_of, next_of
 
     with closing(frames_of(film)) as frames:
         head, frame = next_of(frames, film), next_of(frames, film)
@@ -130,8 +130,8 @@ def first_cameras(
     cloud: GaussianCloud, up: Sequence[float] | None, fov: float, width: int, height: int
 ) -> list[Camera]:
     """Cameras around a splat, from which it fills the picture."""
-    from gaussian_swaying.fitting.cameras import cameras_around
     from gaussian_swaying.gaussians.measures import Gaussians
+    from gaussian_swaying.inverse.cameras import cameras_around
     from gaussian_swaying.suggestion.up import guess_up
 
     splat, draw = Gaussians.of(cloud), torch.Generator().manual_seed(0)

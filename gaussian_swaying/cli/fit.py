@@ -67,8 +67,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def fit(options: argparse.Namespace, begun: list[str]) -> int:
     """Fit and print the table; the command that continues the fit is put into ``begun`` once it can."""
-    from gaussian_swaying.fitting.fit import OURS, check_fit, run_fit
-    from gaussian_swaying.fitting.unknowns import read_plan
+    from gaussian_swaying.inverse.fit import OURS, check_fit, run_fit
+    from gaussian_swaying.inverse.unknowns import read_plan
 
     _check(options)
     if options.film is None:

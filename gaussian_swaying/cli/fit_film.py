@@ -17,7 +17,10 @@ from gaussian_swaying import _program as program
 from gaussian_swaying._files import write_json, write_text
 from gaussian_swaying.cli.camera import CAMERAS, PICTURE, STILLS, VIEW, first_cameras, fov_of, painter_of, transforms
 from gaussian_swaying.cli.preview import keep_aside, up_of, write_starter
-from gaussian_swaying.fitting.cameras import (
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.hold import given_hold
+from gaussian_swaying.gaussians.measures import DIRECTIONS
+from gaussian_swaying.inverse.cameras import (
     Film,
     begins_to_move,
     first_frame,
@@ -27,11 +30,8 @@ from gaussian_swaying.fitting.cameras import (
     open_film,
     pixels_of_focal,
 )
-from gaussian_swaying.fitting.unknowns import SCALE
-from gaussian_swaying.fitting.videos import Footage, read_videos
-from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.hold import given_hold
-from gaussian_swaying.gaussians.measures import DIRECTIONS
+from gaussian_swaying.inverse.unknowns import SCALE
+from gaussian_swaying.inverse.videos import Footage, read_videos
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.suggestion.suggest import suggest
@@ -151,8 +151,8 @@ def _length(given: Sequence[str] | None) -> tuple[str, float] | None:
 
 
 def _registered(options: argparse.Namespace, up: Sequence[float] | None) -> tuple[Seen, str]:
-    from gaussian_swaying.fitting.cameras import find_camera
     from gaussian_swaying.gaussians.formats import read_gaussians
+    from gaussian_swaying.inverse.cameras import find_camera
 
     film = open_film(options.film)
     frame, cloud = first_frame(film), read_gaussians(options.splat, 0)
@@ -188,7 +188,7 @@ def _direction(words: Sequence[str]) -> list[float]:
 def _write_registration(seen: Seen, folder: Path) -> None:
     import imageio.v3 as iio
 
-    from gaussian_swaying.fitting.evidence import side_by_side, titled
+    from gaussian_swaying.inverse.evidence import side_by_side, titled
 
     iio.imwrite(folder / PICTURE, titled(side_by_side(seen.frame, seen.picture.color, seen.picture.alpha)))
 

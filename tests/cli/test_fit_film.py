@@ -18,11 +18,11 @@ from gaussian_swaying.cli import fit_film
 from gaussian_swaying.cli.camera import painter_of
 from gaussian_swaying.cli.fit import main
 from gaussian_swaying.cli.fit_film import Seen, extent, longest_side, plan_text, upright_in
-from gaussian_swaying.fitting.cameras import first_frame, open_film
-from gaussian_swaying.fitting.evidence import HELD_TINT, MOVING
-from gaussian_swaying.fitting.unknowns import SCALE, read_plan
-from gaussian_swaying.fitting.videos import read_videos
 from gaussian_swaying.gaussians.formats import read_gaussians
+from gaussian_swaying.inverse.cameras import first_frame, open_film
+from gaussian_swaying.inverse.evidence import HELD_TINT, MOVING
+from gaussian_swaying.inverse.unknowns import SCALE, read_plan
+from gaussian_swaying.inverse.videos import read_videos
 from gaussian_swaying.recording.video import VideoEncoder
 from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
 

@@ -19,8 +19,8 @@ from gaussian_swaying._numbers import SENSE
 from gaussian_swaying.cli import sweep
 from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.config.parser import COMMON, OPTIONS
-from gaussian_swaying.fitting.unknowns import check_unknowns, read_plan, states_of
 from gaussian_swaying.gaussians.formats import FORMATS
+from gaussian_swaying.inverse.unknowns import check_unknowns, read_plan, states_of
 from gaussian_swaying.rendering.passes import PASSES
 from gaussian_swaying.scenes import FlagScene
 

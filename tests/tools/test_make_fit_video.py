@@ -2,7 +2,7 @@
 
 import pytest
 
-from gaussian_swaying.fitting.videos import read_videos
+from gaussian_swaying.inverse.videos import read_videos
 
 from .conftest import ROOT, tool_of
 

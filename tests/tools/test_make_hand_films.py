@@ -10,8 +10,8 @@ import torch
 import yaml
 
 from gaussian_swaying import Simulation
-from gaussian_swaying.fitting.unknowns import read_plan
-from gaussian_swaying.fitting.videos import read_videos
+from gaussian_swaying.inverse.unknowns import read_plan
+from gaussian_swaying.inverse.videos import read_videos
 
 from .conftest import beside
 

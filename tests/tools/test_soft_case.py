@@ -8,8 +8,8 @@ import pytest
 import yaml
 
 from gaussian_swaying import Simulation
-from gaussian_swaying.fitting.unknowns import read_plan
 from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.inverse.unknowns import read_plan
 
 from .conftest import beside
 

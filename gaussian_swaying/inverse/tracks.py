@@ -1,0 +1,446 @@
+"""Point tracks: Gaussians that a camera sees at rest, followed through its video by Lucas and Kanade's method.
+
+The tracker is OpenCV's pyramidal Lucas-Kanade (Bouguet 2000), frame to frame. A track ends where following it back
+does not return to where it came from.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.gaussians.model import DeformedGaussians
+from gaussian_swaying.inverse.videos import Footage
+from gaussian_swaying.mpm.state import State
+from gaussian_swaying.rendering.cameras.camera import Camera, project, resized_intrinsics
+from gaussian_swaying.rendering.protocol import RenderOutput
+from gaussian_swaying.simulation.draw import Painter
+from gaussian_swaying.simulation.simulation import Simulation
+
+WINDOW, WIDE = 15, 960
+"""Side of the square that is followed, where the longer side of the picture has at most ``WIDE`` [pixels]."""
+
+AROUND = 6.0
+"""Border around the windows in which Gaussians are drawn to see how they overlap, in their standard deviations."""
+
+LARGE = 2.0
+"""Standard deviations of Gaussians that are left out, per the side of a window."""
+
+MANY = 1000
+"""Windows that are averaged at a time, so that memory does not grow with the picture."""
+
+_DRAWN = 1e-3
+"""Least sum of the weights of a Gaussian in a picture with which it counts as visible [pixels]."""
+
+
+class Overlap:
+    """The offset between what a splat shows and where it is, all over a picture.
+
+    Args:
+        painter: Draws the picture.
+        gaussians: All Gaussians of it.
+        camera: Its camera.
+    """
+
+    def __init__(self, painter: Painter, gaussians: DeformedGaussians, camera: Camera) -> None:
+        self.camera = camera
+        share = min(1.0, WIDE / max(camera.width, camera.height))
+        width, height = (round(share * side) for side in (camera.width, camera.height))
+        scale = torch.tensor([width / camera.width, height / camera.height], dtype=torch.float64)
+        small = camera.to("cpu", torch.float64)
+        (fx, _, cx), (_, fy, cy), _ = small.intrinsics.tolist()
+        lens, *_ = resized_intrinsics(camera.width, camera.height, fx, fy, cx, cy, width, height)
+        small = replace(small, intrinsics=lens.double(), width=width, height=height)
+        self._small, self._step = small, window_of(width, height) // 2
+        rows, columns = (torch.arange(0, side, self._step) for side in (height, width))
+        places = torch.cartesian_prod(rows, columns).flip(-1) + 0.5
+        found = drawn_beside(painter, gaussians, small.to(painter.device, camera.intrinsics.dtype), places)
+        self._field = (found / scale).T.reshape(1, 2, len(rows), len(columns))
+
+    def at(self, places: Tensor) -> Tensor:
+        """The offset at places in space (N, 3), float64: rendered minus projected pixels, shape (N, 2)."""
+        pixel = project(places, self._small)[0]
+        ends = self._step * (torch.tensor(self._field.shape[:1:-1]) - 1)  # the last column and row
+        grid = 2 * (pixel - 0.5) / ends - 1
+        grid = grid[None, None]
+        found = torch.nn.functional.grid_sample(self._field, grid, padding_mode="border", align_corners=True)
+        return found[0, :, 0].T
+
+
+def drawn_beside(painter: Painter, gaussians: DeformedGaussians, camera: Camera, places: Tensor) -> Tensor:
+    """Return the offset between the rendered and the projected centres of Gaussians, averaged over windows.
+
+    The rendered centre of a Gaussian is the mean of all pixels, weighted by its share of each after alpha compositing.
+    These weights are the derivatives of the picture by the colours. Gaussians larger than windows, as those of a sky,
+    have no place in them, and are left out.
+
+    Args:
+        painter: Draws the picture.
+        gaussians: All Gaussians of it, N.
+        camera: Its camera, on their device.
+        places: Centres of the windows [pixels], shape (T, 2).
+
+    Returns:
+        Rendered minus projected centre [pixels], float64, shape (T, 2).
+    """
+    if not len(places):
+        return torch.zeros(0, 2, dtype=torch.float64)
+    opacity, whole = painter.opacity().detach(), (camera.width, camera.height)
+    pixel, depth = project(gaussians.means, camera)
+    wide = gaussians.covariances.diagonal(dim1=-2, dim2=-1).amax(-1).sqrt().to(depth)
+    size = wide * float(camera.intrinsics[0, 0]) / depth.clamp(min=camera.near)
+    small = size < LARGE * window_of(*whole)
+    camera, left, top = _part(camera, pixel, size, small & (depth > camera.near), places)
+    width, height = camera.width, camera.height
+
+    def drawn(colours: Tensor) -> Tensor:
+        return painter.renderer(gaussians.means, gaussians.covariances, opacity, colours, camera).color
+
+    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    middle = torch.tensor([0.5 * width, 0.5 * height])
+    asked = torch.stack([torch.ones(height, width), x - middle[0], y - middle[1]], -1).to(opacity)
+    colours = torch.zeros(len(opacity), 3, device=opacity.device, requires_grad=True)
+    with torch.enable_grad():
+        (sums,) = torch.autograd.grad(drawn(colours), colours, asked)
+    weight, centre = sums[:, :1], (project(gaussians.means, camera)[0] - middle).to(sums)
+    counts = (weight > _DRAWN) & small.to(weight.device)[:, None]
+    shift = torch.where(counts, sums[:, 1:] / weight - centre, 0.0)
+    with torch.no_grad():
+        field = drawn(torch.cat([shift, counts.to(shift)], 1)).cpu().double()
+    found = torch.cat(
+        [
+            field[row - top, column - left].mean(1)
+            for column, row in (windows(some, *whole) for some in places.split(MANY))
+        ]
+    )
+    return found[:, :2] / found[:, 2:].clamp(min=1e-6)
+
+
+def _part(camera: Camera, pixel: Tensor, size: Tensor, some: Tensor, places: Tensor) -> tuple[Camera, int, int]:
+    """The camera of some windows and what is around them, also beyond the picture; its left and upper end.
+
+    Args:
+        camera: The camera of the picture.
+        pixel: Centres of the Gaussians [pixels], shape (N, 2).
+        size: Their standard deviations [pixels], shape (N,).
+        some: Those that are to be whole, bool, shape (N,).
+        places: Centres of the windows [pixels], shape (T, 2).
+    """
+    outer = windows(torch.stack([places.amin(0), places.amax(0)]), camera.width, camera.height)
+    low, high = (torch.stack([end(side) for side in outer]).to(pixel) for end in (torch.min, torch.max))
+    near = size[some & ((pixel >= low) & (pixel <= high)).all(-1)]
+    border = math.ceil(AROUND * float(near.kthvalue(math.ceil(0.95 * len(near))).values)) if len(near) else 0
+    left, top = (int(end) - border for end in low)
+    right, bottom = (int(end) + border + 1 for end in high)
+    lens = camera.intrinsics.clone()
+    lens[:2, 2] -= lens.new_tensor([left, top])
+    return replace(camera, intrinsics=lens, width=right - left, height=bottom - top), left, top
+
+
+def window_of(width: int, height: int) -> int:
+    """Side of the square that is followed in a picture of this size [pixels]; odd."""
+    return 2 * round(WINDOW // 2 * max(1.0, max(width, height) / WIDE)) + 1
+
+
+def windows(places: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """Columns and rows of the pixels in the window around each place (T, 2), clamped to the picture; shape (T, W²)."""
+    side = window_of(width, height)
+    reach = torch.arange(side) - side // 2
+    beside = torch.cartesian_prod(reach, reach)
+    column, row = (places.long()[:, None] + beside).unbind(-1)
+    return column.clamp(0, width - 1), row.clamp(0, height - 1)
+
+
+LEVELS = 3
+BACK = 0.5
+"""Largest distance between a point and the one found by following it back [pixels]."""
+
+STILL = 0.5
+"""Largest distance that a point moves which stands still [pixels]: noise and compression."""
+
+QUALITY = 0.02
+"""Least texture of a point, as a share of the best one: smallest eigenvalue of the structure tensor."""
+
+EDGE = 4.0
+"""Least distance from the edges of the picture [pixels]."""
+
+ALIKE = 0.7
+"""Least correlation of a point's surroundings in a picture of the splat and in the first frame."""
+
+OPAQUE = 0.3
+"""Least opacity of a Gaussian that is followed."""
+
+BEHIND = 0.03
+"""Largest depth of a visible Gaussian behind the rendered depth, as a share of the object's size."""
+
+THIN = 0.25
+"""Gaussians near the border of the object are left out if at least this share of the visible ones lies a window away
+from it. In an object as thin as a window, all are kept."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Gaussians that were followed in the video of one camera.
+
+    Attributes:
+        index: Their indices among the moving Gaussians of the scene, shape (T,).
+        position: Position of each in the picture [pixels], float64, shape (F, T, 2).
+        seen: Whether the track is still valid, bool, shape (F, T).
+    """
+
+    index: Tensor
+    position: Tensor
+    seen: Tensor
+
+
+def track(simulation: Simulation, video: Footage, most: int = 400, first: DeformedGaussians | None = None) -> Tracks:
+    """Follow the Gaussians that a camera sees in its first frame.
+
+    Args:
+        simulation: The scene, at rest where the video begins.
+        video: The video.
+        most: Largest number of tracks; those with the most texture are taken.
+        first: What the first frame shows, about, if it is not the scene at rest. The Gaussians are followed from a
+            picture of it to the first frame; those whose surroundings do not look alike there are not seen.
+    """
+    if first is None:
+        chosen, start = _chosen(simulation, video, _grey(video.images[0]), most)
+        position, seen = map(torch.from_numpy, follow(video.images.numpy(), start.numpy()))
+        return Tracks(chosen, position, seen)
+    drawn = drawn_by(simulation, first, video.cameras[0])
+    chosen, start = _chosen(simulation, video, _grey(drawn), most, first)
+    images = torch.cat([drawn[None], video.images])
+    position, seen = map(torch.from_numpy, follow(images.numpy(), start.numpy()))
+    seen &= _alike(images[:2], position[:2]) > ALIKE
+    if video.itself:  # where the splat shows them is beside their places
+        position += drawn_beside(simulation.painter, first, video.cameras[0].to(simulation.painter.device), start)
+    return Tracks(chosen, position[1:], seen[1:])
+
+
+def drawn_by(simulation: Simulation, gaussians: DeformedGaussians, camera: Camera) -> Tensor:
+    """The picture of some Gaussians in a camera, dtype uint8, shape (H, W, 3)."""
+    painter = simulation.painter
+    own = camera.to(painter.device)
+    with torch.no_grad():
+        colour = painter.picture(gaussians, own).color
+    return (colour.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
+
+
+def beside_rest(simulation: Simulation, video: Footage, most: int = 400) -> float:
+    """Distance between the splat at rest and the first frame of a video [pixels], of the upper quarter of points.
+
+    A shift of all points alike is a fault of the camera, and left out.
+    """
+    rest, moving = simulation.scene.rest(), simulation.scene.moving
+    found = track(simulation, replace(video, images=video.images[:1]), most, rest)
+    means = rest.means[moving[found.index.to(moving.device)]].cpu()
+    off = (found.position[0] - project(means, video.cameras[0])[0])[found.seen[0]]
+    return float((off - off.median(0).values).norm(dim=-1).quantile(0.75)) if len(off) else 0.0
+
+
+def _alike(images: Tensor, position: Tensor) -> Tensor:
+    """Correlation of the surroundings of points in two pictures (2, H, W, 3) at positions (2, T, 2), shape (T,)."""
+    side = window_of(images.shape[2], images.shape[1])
+    planes = images.double().mean(-1)[:, None]
+    height, width = planes.shape[-2:]
+    reach = torch.arange(side, dtype=torch.float64) - side // 2
+    row, column = torch.meshgrid(reach, reach, indexing="ij")
+    places = position[:, :, None] + torch.stack([column, row], -1).reshape(1, 1, -1, 2)
+    grid = 2 * places / torch.tensor([width, height], dtype=torch.float64) - 1
+    found = torch.nn.functional.grid_sample(planes, grid, padding_mode="border", align_corners=False)[:, 0]
+    found = found - found.mean(-1, keepdim=True)
+    return (found[0] * found[1]).sum(-1) / (found[0].norm(dim=-1) * found[1].norm(dim=-1)).clamp(min=1e-9)
+
+
+def still_until(simulation: Simulation, video: Footage, tracks: Tracks) -> float:
+    """Time of the last frame before what is followed begins to move [s]; 0 if it moves in the first frames.
+
+    A point has moved if it is more than :data:`STILL` from where the camera of the frame would see it if it had stayed.
+    A quarter of the points has to.
+
+    Args:
+        simulation: The scene.
+        video: The video.
+        tracks: Its tracks.
+    """
+    scene = simulation.scene
+    means = scene.model.means.detach()[scene.moving[tracks.index.to(scene.moving.device)]]
+    off = tracks.position - torch.stack([project(means, camera)[0] for camera in video.cameras])
+    moved = (off - off[:1]).norm(dim=-1)
+    moved = torch.where(tracks.seen, moved, torch.nan).nanquantile(0.75, dim=1)
+    begun = (moved > STILL).nonzero()[:, 0]
+    return float(video.times[max(int(begun[0]) - 1, 0)]) if len(begun) else 0.0
+
+
+def match(
+    simulation: Simulation, video: Footage, states: Sequence[State], most: int = 400, moving: bool = False
+) -> Tracks:
+    """Find the Gaussians of a simulation in the video: match each rendered frame with the frame of the camera.
+
+    Nothing drifts, as every frame is matched anew, and a Gaussian that comes into sight again is found again. The
+    simulation must already be near, within a few tens of pixels.
+
+    Where Gaussians overlap, the picture shows mostly the nearest ones. So it shows a Gaussian beside its projected
+    centre, by a part of a pixel that depends on the angle of view (:func:`drawn_beside`). A video of the real object
+    does not have this offset; one that was rendered from the splat has it, too. The first frame, at rest, shows which
+    is the case. The offset that remains there comes from a camera that is not quite right: its median is subtracted in
+    all frames, unless the video begins in motion.
+
+    Near the border of the object a window shows more border than texture, and the border of a splat is not quite that
+    of the real object. Such Gaussians are left out.
+
+    Args:
+        simulation: The scene.
+        video: The video.
+        states: The state at the time of each frame of the video; fewer if only the first frames are wanted.
+        most: Largest number of Gaussians.
+        moving: Whether the video begins in motion.
+    """
+    import numpy as np
+
+    scene, painter, count = simulation.scene, simulation.painter, len(video.times)
+    if moving:
+        begun = painter.deformed(states[0])
+        chosen, _ = _chosen(simulation, video, _grey(drawn_by(simulation, begun, video.cameras[0])), most, begun)
+    else:
+        chosen, _ = _chosen(simulation, video, _grey(video.images[0]), most)
+    index = scene.moving[chosen.to(scene.moving.device)]
+    position = torch.zeros(count, len(chosen), 2, dtype=torch.float64)
+    seen = torch.zeros(count, len(chosen), dtype=torch.bool)
+    share, shift = 0.0, torch.zeros(2, dtype=torch.float64)
+    for k, state in enumerate(states):
+        camera = video.cameras[k].to(painter.device)
+        with torch.no_grad():
+            gaussians = painter.deformed(state)
+            picture = painter.picture(gaussians, camera)
+        pixel, depth = project(gaussians.means[index], video.cameras[k])
+        there = _inside(pixel, picture, _in_sight(pixel, depth, picture, BEHIND * scene.size))
+        shown = (picture.color.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+        pair = np.stack([shown, video.images[k].numpy()])
+        found, good = follow(pair, pixel.numpy())
+        position[k], seen[k] = torch.from_numpy(found[1]), torch.from_numpy(good[1]) & there
+        if k == 0 or share:
+            beside = drawn_beside(painter, gaussians, camera, pixel)
+            if k == 0 and bool(seen[0].any()):
+                share, shift = _at_rest((position[0] - pixel)[seen[0]], beside[seen[0]])
+                shift = torch.zeros_like(shift) if moving else shift
+            position[k] += share * beside
+        position[k] -= shift
+    return Tracks(chosen, position, seen)
+
+
+def _at_rest(off: Tensor, beside: Tensor) -> tuple[float, Tensor]:
+    """Return the share of the splat's offsets that a video at rest lacks, 0 to 1, and the median of the rest (2,).
+
+    Args:
+        off: Offset of the matched positions in the video from the projected centres [pixels], shape (T, 2).
+        beside: From :func:`drawn_beside`, shape (T, 2).
+    """
+    share = float((-(off * beside).sum() / beside.square().sum().clamp(min=1e-12)).clamp(0.0, 1.0))
+    return share, (off + share * beside).median(0).values
+
+
+def follow(images: Any, start: Any) -> tuple[Any, Any]:
+    """Follow points through a video.
+
+    Args:
+        images: Frames as NumPy array, dtype uint8, shape (F, H, W, 3).
+        start: Points in the first frame [pixels; the first pixel's centre is at 0.5], shape (T, 2).
+
+    Returns:
+        NumPy arrays: positions, float64, shape (F, T, 2), and whether each is still valid, shape (F, T).
+    """
+    import numpy as np
+
+    cv2 = opencv()
+    count, (height, width) = len(start), images.shape[1:3]
+    options = {"winSize": (window_of(width, height),) * 2, "maxLevel": LEVELS}
+    options["criteria"] = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 40, 0.001)
+    position = np.zeros((len(images), count, 2))
+    seen = np.zeros((len(images), count), dtype=bool)
+    now = np.ascontiguousarray(start - 0.5, dtype=np.float32)[:, None]
+    position[0], seen[0] = now[:, 0] + 0.5, True
+    for k in range(1, len(images)):
+        if not count:
+            break
+        there, found, _ = cv2.calcOpticalFlowPyrLK(images[k - 1], images[k], now, None, **options)
+        back, returned, _ = cv2.calcOpticalFlowPyrLK(images[k], images[k - 1], there, None, **options)
+        off = np.linalg.norm((back - now)[:, 0], axis=-1)
+        inside = ((there[:, 0] >= 0) & (there[:, 0] <= (width - 1, height - 1))).all(-1)
+        good = (found[:, 0] > 0) & (returned[:, 0] > 0) & (off < BACK) & inside
+        seen[k] = seen[k - 1] & good
+        now = np.where(seen[k][:, None, None], there, now)
+        position[k] = now[:, 0] + 0.5
+    return position, seen
+
+
+def _chosen(
+    simulation: Simulation, video: Footage, grey: Any, most: int, first: DeformedGaussians | None = None
+) -> tuple[Tensor, Tensor]:
+    """Return Gaussians that are visible at first and have texture around them, a few pixels apart; and their pixels."""
+    import numpy as np
+
+    scene, painter, camera = simulation.scene, simulation.painter, video.cameras[0]
+    with torch.no_grad():
+        first, own = first or scene.rest(), camera.to(painter.device)
+        pixel, depth = project(first.means[scene.moving], camera)
+        picture = painter.picture(first, own)
+    opaque = scene.model.opacity().cpu()[scene.moving.cpu()] > OPAQUE
+    place = (_in_sight(pixel, depth, picture, BEHIND * scene.size) & opaque).nonzero()[:, 0]
+    column, row = pixel[place].long().unbind(-1)
+    width, height = video.size
+    texture = torch.from_numpy(np.asarray(opencv().cornerMinEigenVal(grey, 7)))
+    score = texture[row, column]
+    sharpest = texture.max() if scene.all_move else score.amax() if len(score) else 0.0  # not that of a background
+    good = score > QUALITY * sharpest
+    place, score, column, row = (part[good] for part in (place, score, column, row))
+    order = score.argsort(descending=True, stable=True)
+    taken = torch.zeros(height + 8, width + 8, dtype=torch.bool)
+    kept: list[int] = []
+    for k in order.tolist():
+        r, c = int(row[k]), int(column[k])
+        if len(kept) < most and not taken[r + 4, c + 4]:
+            taken[r + 2 : r + 7, c + 2 : c + 7] = True
+            kept.append(int(place[k]))
+    chosen = torch.tensor(sorted(kept), dtype=torch.long)
+    return chosen, pixel[chosen]
+
+
+def _in_sight(pixel: Tensor, depth: Tensor, picture: RenderOutput, behind: float) -> Tensor:
+    """Mask of points (T, 2) at depths (T,) that lie in a picture, away from its edges, and not behind its surface."""
+    expected = (picture.depth / picture.alpha.clamp(min=1e-3))[..., 0].cpu()
+    height, width = expected.shape
+    inside = (pixel > EDGE).all(-1) & (pixel[:, 0] < width - EDGE) & (pixel[:, 1] < height - EDGE) & (depth > 0)
+    column, row = torch.where(inside[:, None], pixel, EDGE).long().unbind(-1)
+    return inside & (depth < expected[row, column] + behind)
+
+
+def _inside(pixel: Tensor, picture: RenderOutput, there: Tensor) -> Tensor:
+    """Mask of the points ``there`` whose window contains no border of the object; all of them if hardly any is left."""
+    alpha = picture.alpha[..., 0].cpu()
+    column, row = windows(pixel, alpha.shape[1], alpha.shape[0])
+    inside = there & (alpha[row, column] >= 0.5).all(-1)
+    return inside if int(inside.sum()) >= THIN * int(there.sum()) else there
+
+
+def _grey(images: Tensor) -> Any:
+    weights = torch.tensor([0.299, 0.587, 0.114])
+    return (images.float() @ weights).round().clamp(0, 255).to(torch.uint8).numpy()
+
+
+def opencv() -> Any:
+    """Import and return ``cv2`` (OpenCV), which tracks points."""
+    try:
+        import cv2
+    except ImportError as error:
+        raise ImportError(
+            "Tracks, matches and registration need OpenCV: pip install 'gaussian-swaying[fit]', or leave tracks and "
+            "matches out of `stages`.",
+            name="cv2",
+        ) from error
+    return cv2

@@ -1,0 +1,47 @@
+"""A small printed flag in the wind."""
+
+import pytest
+
+from gaussian_swaying.inverse.fit import Fit, fit
+from gaussian_swaying.inverse.unknowns import Plan, read_unknown
+from gaussian_swaying.inverse.videos import read_videos
+from gaussian_swaying.simulation.simulation import Simulation
+
+
+@pytest.fixture
+def simulation(own):
+    """The flag."""
+    return Simulation.from_yaml(own / "base.yaml", device="cpu")
+
+
+@pytest.fixture
+def plan_of(own):
+    """The plan of a fit of unknowns with these ranges to a video of the flag."""
+
+    def plan_of(unknowns, folder=None, **settings):
+        sought = [read_unknown(*one) for one in unknowns.items()]
+        return Plan([str(own / "base.yaml")], [str(folder or own / "video")], sought, **settings)
+
+    return plan_of
+
+
+@pytest.fixture
+def fit_of(plan_of, simulation):
+    """Such a fit, of some videos instead of those of the plan if they are given."""
+
+    def fit_of(unknowns, folder=None, videos=None, further=None, **settings):
+        plan = plan_of(unknowns, folder, **settings)
+        return Fit(simulation, videos or read_videos(plan.videos), plan, **(further or {}))
+
+    return fit_of
+
+
+@pytest.fixture
+def fitted(own, tmp_path):
+    """The result of a whole fit, whose folder is ``fit``."""
+
+    def fitted(unknowns, folder=None, **settings):
+        options = {"device": "cpu", "progress": False} | settings
+        return fit(own / "base.yaml", folder or own / "video", unknowns, tmp_path / "fit", **options)
+
+    return fitted

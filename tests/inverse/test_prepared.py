@@ -1,0 +1,87 @@
+"""Films as a fit takes them: which of them are changed, and what is said of it."""
+
+import pytest
+import torch
+from bench.problems.films import shaken
+from handheld_films import drift, tripod, write_base, write_film
+from shared import peak, value_error
+
+from gaussian_swaying.inverse import evidence as module
+from gaussian_swaying.inverse.evidence import Judged, prepared
+from gaussian_swaying.inverse.unknowns import read_plan
+from gaussian_swaying.inverse.videos import read_videos
+from gaussian_swaying.simulation.simulation import Simulation
+
+pytest.importorskip("cv2", reason="needs the extra [fit]")
+
+FRAMES = 7
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("prepared")
+    write_base(folder, wall=0.04)
+    simulation = Simulation.from_yaml(folder / "base.yaml", device="cpu")
+    still = tripod(200, 120)
+    write_film(simulation, folder / "tripod", [still] * FRAMES, drift(FRAMES))
+    write_film(simulation, folder / "hand", shaken(still, FRAMES, 2.0))
+    return folder
+
+
+@pytest.fixture
+def simulation(folder):
+    return Simulation.from_yaml(folder / "base.yaml", device="cpu")
+
+
+def test_a_tripod_keeps_its_camera_and_loses_the_drift(folder, simulation):
+    (video,) = read_videos(folder / "tripod")
+    lines = []
+    (found,), (judged,) = prepared(simulation, [video], say=lines.append)
+    assert found.cameras is video.cameras
+    assert not judged.hand_held
+    assert judged.moved < 0.3
+    assert judged.gains[0][2] == pytest.approx(0.65, abs=0.05)
+    means = found.images.double().mean((1, 2))
+    assert peak(means[-1] / means[0] - 1) < 0.05
+    assert lines == judged.sentences()
+    assert "blue 0.6" in lines[0]
+
+
+def test_a_hand_is_noticed_unless_the_file_says_otherwise(folder, simulation):
+    (video,) = read_videos(folder / "hand")
+    (found,), (judged,) = prepared(simulation, [video])
+    assert judged.hand_held
+    assert not torch.equal(found.cameras[-1].world_to_camera, found.cameras[0].world_to_camera)
+    (found,), (judged,) = prepared(simulation, [video], hand_held=False)
+    assert found.cameras is video.cameras
+    (still,) = read_videos(folder / "tripod")
+    assert prepared(simulation, [still], hand_held=True)[1][0].hand_held
+
+
+def test_without_opencv_nothing_changes(folder, simulation, monkeypatch):
+    monkeypatch.setattr(module, "find_spec", lambda name: None)
+    videos, lines = read_videos(folder / "hand"), []
+    assert prepared(simulation, videos, say=lines.append)[0][0] is videos[0]
+    assert lines == ["Without OpenCV nothing says whether a camera moves, or its exposure drifts."]
+
+
+def test_many_frames_without_background_make_a_fit_doubtful():
+    assert Judged("0", 10, hand_held=True, unseen=2).doubts() == []
+    (doubt,) = Judged("0", 10, hand_held=True, unseen=3).doubts()
+    assert doubt.startswith("camera 0: 3 of 10 frames show too little")
+    (said,) = Judged("0", 10, moved=12.3, hand_held=True, residual=0.3, unseen=3).sentences()
+    assert said.endswith("0.30 pixels off; 3 of 10 frames have that of their neighbours.")
+
+
+def test_the_fit_file(tmp_path):
+    file = tmp_path / "fit.yaml"
+    lines = "base: [printed_flag]\nvideos: [film]\nunknowns: {wind.speed: [1, 9]}\n"
+    file.write_text(lines + "hand_held: true\nalso_moves: tree\n")
+    plan = read_plan(file)
+    assert plan.hand_held is True
+    assert plan.also_moves == ["tree"]
+    file.write_text(lines)
+    assert read_plan(file).hand_held is None
+    file.write_text(lines + "hand_held: maybe\n")
+    with value_error(r"`hand_held` in .* to be true or false, but got 'maybe'"):
+        read_plan(file)

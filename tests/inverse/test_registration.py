@@ -1,0 +1,90 @@
+"""The camera of a frame, found from pictures of a splat."""
+
+import math
+
+import pytest
+import torch
+from shared import double, randn, seeded, value_error
+
+from gaussian_swaying import Simulation
+from gaussian_swaying.inverse.cameras import cameras_around, find_camera
+from gaussian_swaying.rendering.cameras.camera import look_at_camera
+from gaussian_swaying.scenes.procedural import FlagScene
+
+pytest.importorskip("cv2")
+
+WIDTH, HEIGHT, FOV = 320, 240, 45.0
+MIDDLE, EYE, UP = torch.tensor([0.6, 0.0, 0.4]), [1.1, -1.7, 0.9], [0.0, 0.0, 1.0]
+
+
+@pytest.fixture(scope="module")
+def draw():
+    """Pictures of a printed flag at rest, which bulges so that its depth differs."""
+    simulation = Simulation(FlagScene(spacing=0.012, pattern="printed", ripple=0.06), device="cpu")
+    painter, state = simulation.painter, simulation.stepper.start()
+    gaussians = painter.deformed(state)
+
+    def picture(camera):
+        with torch.no_grad():
+            return painter.picture(gaussians, camera)
+
+    return picture
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return look_at_camera(EYE, MIDDLE, UP, FOV, WIDTH, HEIGHT, dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def frame(draw, truth):
+    """In another light: darker from left to right, warmer, and with the noise of a sensor."""
+    colour = draw(truth).color.double().clamp(0, 1)
+    light = torch.linspace(1.0, 0.5, WIDTH, dtype=torch.float64)[None, :, None] * torch.tensor([1.0, 0.9, 0.7])
+    noise = 0.01 * randn(colour.shape, generator=seeded(0))
+    return (255 * (light * colour**1.2 + noise).clamp(0, 1)).round().to(torch.uint8)
+
+
+def _off(camera, truth):
+    """Angle between two cameras [degrees], and their distance per that to the middle of the flag."""
+    a, b = camera.world_to_camera.double()[:3, :3], truth.world_to_camera[:3, :3]
+    angle = math.degrees(math.acos(min(1.0, float(((a @ b.T).trace() - 1) / 2))))
+    return angle, float((camera.position.double() - truth.position).norm() / (truth.position - MIDDLE).norm())
+
+
+def test_from_a_camera_that_is_near(draw, frame, truth):
+    near = look_at_camera([0.7, -2.2, 0.6], [0.55, 0.0, 0.45], UP, FOV, WIDTH, HEIGHT, dtype=torch.float64)
+    found = find_camera(draw, frame, [near])
+    angle, distance = _off(found.camera, truth)
+    assert angle < 0.5
+    assert distance < 0.01
+    assert found.agreeing > 0.5 * found.matches
+    assert found.residual < 1.0
+
+
+def test_from_no_camera(draw, frame, truth):
+    around = cameras_around(MIDDLE, 2.2, UP, FOV, WIDTH, HEIGHT, count=8, elevations=(10.0,))
+    angle, distance = _off(find_camera(draw, frame, around).camera, truth)
+    assert angle < 0.5
+    assert distance < 0.01
+
+
+def test_with_the_focal_length(draw, frame, truth):
+    near = look_at_camera([0.7, -2.2, 0.6], MIDDLE, UP, 1.15 * FOV, WIDTH, HEIGHT, dtype=torch.float64)
+    found = find_camera(draw, frame, [near], focal=True).camera
+    assert float(found.intrinsics[0, 0] / truth.intrinsics[0, 0]) == pytest.approx(1, abs=0.03)
+    assert _off(found, truth)[0] < 0.7
+
+
+def test_cameras_around_look_at_the_middle():
+    for camera in cameras_around(MIDDLE, 2.0, UP, FOV, WIDTH, HEIGHT, count=4):
+        local = camera.world_to_camera[:3, :3] @ MIDDLE.double() + camera.world_to_camera[:3, 3]
+        torch.testing.assert_close(local, double([0.0, 0.0, 2.0]), atol=1e-9, rtol=0)
+        assert float(camera.world_to_camera[1, 2]) < 0  # z up is up in the picture
+
+
+def test_what_cannot_be_found_is_refused(draw, truth):
+    with value_error("was not found in the frame"):
+        find_camera(draw, torch.full((HEIGHT, WIDTH, 3), 90, dtype=torch.uint8), [truth])
+    with value_error("the frame's size, 100 x 80"):
+        find_camera(draw, torch.zeros(80, 100, 3, dtype=torch.uint8), [truth])

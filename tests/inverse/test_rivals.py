@@ -1,0 +1,113 @@
+"""Other values that may explain the same film."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+from small_films import TRUTH
+
+from gaussian_swaying.inverse.unknowns import SCANNED, SHAKEN, apart_by, bent_alike, mirrored, read_unknown, rivals_of
+from gaussian_swaying.simulation.model import flow_of
+
+pytest.importorskip("cv2", reason="needs the extra [fit]")
+
+
+def test_the_wind_is_mirrored_at_the_normal_of_a_sheet(simulation):
+    """The flag is nearly the plane of x and z: a wind along +x + y has the same pressure as one along -x + y."""
+    assert mirrored(simulation.model, {"wind.azimuth": 56.0}) == pytest.approx(124.0, abs=3.0)
+    patches = simulation.scene.patches
+    pressed = []
+    for azimuth in (56.0, mirrored(simulation.model, {"wind.azimuth": 56.0})):
+        flow = torch.tensor(flow_of((3.0, 0.0, 0.0), {"wind.azimuth": azimuth}))
+        pressed.append(float((patches.area * (patches.normal @ flow).square()).sum()))
+    assert pressed[1] == pytest.approx(pressed[0], rel=1e-4)
+
+
+def test_a_wind_across_a_sheet_or_along_it_is_its_own_mirror_image(simulation):
+    """Along it, the image blows the other way: a flag would be on the other side of its pole, which a fit can try."""
+    assert mirrored(simulation.model, {"wind.azimuth": 90.0}) is None
+    assert math.cos(math.radians(mirrored(simulation.model, {"wind.azimuth": 0.0}))) == pytest.approx(-1, abs=0.01)
+
+
+def test_a_large_patch_counts_as_its_area():
+    """Nine patches that face x have less area than the one that faces y, at which the wind is mirrored."""
+    normal = torch.tensor([[1.0, 0.0, 0.0]] * 9 + [[0.0, 1.0, 0.0]])
+    area = torch.tensor([0.001] * 9 + [0.5])
+    model = SimpleNamespace(scene=SimpleNamespace(patches=SimpleNamespace(normal=normal, area=area)))
+    assert mirrored(model, {"wind.azimuth": 56.0}) == pytest.approx(124.0)
+
+
+def test_a_body_that_faces_all_ways_has_no_mirror_image(simulation):
+    patches = simulation.scene.patches
+    turn = torch.linspace(0, math.pi, len(patches.normal))
+    normal, own = torch.stack([turn.cos(), turn.sin(), torch.zeros_like(turn)], -1), patches.normal
+    patches.normal = normal
+    try:
+        assert mirrored(simulation.model, {"wind.azimuth": 56.0}) is None
+    finally:
+        patches.normal = own
+
+
+def test_rivals_lie_within_the_ranges(simulation):
+    sought = [read_unknown("wind.azimuth", [-80.0, 160.0]), read_unknown("material.E", [1e3, 1e5])]
+    softer, stiffer, other = rivals_of(simulation.model, sought, [0.5, 0.95])
+    assert (softer, stiffer) == ([0.5, pytest.approx(0.95 - SHAKEN)], [0.5, 1.0])
+    assert sought[0].value(other[0]) == pytest.approx(140.0, abs=3.0)
+    assert other[1] == 0.95
+    narrow = [read_unknown("wind.azimuth", [0.0, 90.0])]
+    assert rivals_of(simulation.model, narrow, [0.5]) == []  # 135 degrees is known to be wrong
+    around = [read_unknown("wind.azimuth", [150.0, 450.0])]
+    (again,) = rivals_of(simulation.model, around, [0.6])  # 330 degrees is -30
+    assert around[0].value(again[0]) == pytest.approx(210.0, abs=3.0)
+
+
+def test_a_fit_tries_them_at_its_end(simulation, fit_of):
+    """The mirror image fits better, so the fit goes on there."""
+    made = fit_of({"wind.azimuth": [0.0, 180.0]})
+    made._brief = lambda places, evidence, times: (places[::-1], [1.0, 2.0])
+    others, better = made._others([0.3], [])
+    assert better == rivals_of(simulation.model, made.plan.unknowns, [0.3])[0]
+    assert made.values(better)["wind.azimuth"] == pytest.approx(180 - 54, abs=3.0)
+    assert others == [made.values(better)]
+
+
+def test_the_mirrored_wind_is_a_rival_for_longer(fit_of):
+    """It differs by less than a model's errors."""
+    made = fit_of({"wind.azimuth": [0.0, 180.0]})
+    for end, cost, told in ((0.7, 1.2, True), (0.65, 1.2, True), (0.7, 1.3, False), (0.95, 1.2, False)):
+        made._brief = lambda places, evidence, times, end=end, cost=cost: ([places[0], [end]], [1.0, cost])
+        others, better = made._others([0.3], [])
+        assert (others == [made.values([end])], better) == (told, [])
+
+
+def test_other_stiffnesses_bend_as_far():
+    """All over the range of E, with the square of the speed in proportion where its range allows that."""
+    sought = [read_unknown("wind.speed", [1.0, 9.0]), read_unknown("material.E", [1e3, 1e5])]
+    start = [sought[0].share(3.0), sought[1].share(1e4)]
+    found = [[u.value(share) for u, share in zip(sought, place, strict=True)] for place in bent_alike(sought, start)]
+    assert len(found) == SCANNED
+    assert [e for _, e in found] == pytest.approx([1e3 * 100 ** ((k + 0.5) / SCANNED) for k in range(SCANNED)])
+    for speed, e in found:
+        assert speed == pytest.approx(min(max(3.0 * math.sqrt(e / 1e4), 1.0), 9.0))
+    assert bent_alike(sought[:1], start[:1]) == bent_alike(sought[1:], start[1:]) == []
+
+
+def test_the_search_finds_the_stiffness_although_its_start_is_three_times_off(fit_of):
+    """The start stays the first, and is not the best."""
+    sought = {
+        "wind.speed": {"range": [1.0, 20.0], "start": 15.0}, "material.E": {"range": [1e3, 1e5], "start": 3e4}
+    }  # fmt: skip
+    made = fit_of(sought, search=16, starts=2)
+    begin, best = (made.values(place) for place in made.search())
+    assert begin == pytest.approx({"wind.speed": 15.0, "material.E": 3e4})
+    assert best["material.E"] == pytest.approx(TRUTH["material.E"], rel=0.6)
+    assert best["wind.speed"] == pytest.approx(TRUTH["wind.speed"], rel=0.3)
+
+
+def test_azimuths_that_are_a_turn_apart_are_the_same():
+    sought = [read_unknown("wind.azimuth", [-200.0, 200.0]), read_unknown("wind.speed", [1.0, 9.0])]
+    at = [sought[0].share(179.0), 0.5]
+    assert apart_by(sought, at, [sought[0].share(-179.0), 0.5]) == pytest.approx(2 / 400)
+    assert apart_by(sought, at, [sought[0].share(139.0), 0.5]) == pytest.approx(40 / 400)
+    assert apart_by(sought, at, [at[0], 0.3]) == pytest.approx(0.2)

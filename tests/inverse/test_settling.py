@@ -1,0 +1,176 @@
+"""A fit says whether its values have settled."""
+
+import json
+from dataclasses import replace
+from itertools import groupby
+from operator import itemgetter
+
+import pytest
+import torch
+from shared import double, peak
+
+from gaussian_swaying.inverse.evidence import Block
+from gaussian_swaying.inverse.fit import (
+    NO_STEP,
+    Fit,
+    Progress,
+    expected_gain,
+    iterate,
+    linearised,
+    run_fit,
+    step_from,
+    unsettled,
+)
+from gaussian_swaying.inverse.report import Result, Shown
+from gaussian_swaying.inverse.unknowns import Unknown
+
+from .test_least_squares import valley
+
+UNKNOWNS = [Unknown("wind.speed", 1.0, 10.0, "log"), Unknown("material.E", 1e3, 1e5, "log")]
+SCALES = {"tracks": 0.1}
+
+
+def _fitted(iterations):
+    progress = Progress(double([0.3, 0.081]))
+    while not progress.done and progress.iteration < iterations:
+        iterate(valley, lambda blocks: SCALES, progress, 1e-5)
+    return progress
+
+
+def _told(progress, ended=None):
+    return unsettled(progress.normal, progress.place, UNKNOWNS, progress.done if ended is None else ended)
+
+
+def test_a_fit_in_the_lowest_place_has_settled():
+    progress = _fitted(60)
+    assert progress.done
+    assert _told(progress) == ""
+
+
+def test_iterations_that_ran_out_on_the_way_are_told_with_the_remedy():
+    found = _told(_fitted(1))
+    for words in ("not settled", "`iterations` ran out", "raising wind.speed by", "--resume"):
+        assert words in found
+    assert found.count(". ") == 0
+
+
+def test_a_direction_that_nothing_shows_is_not_called_unsettled():
+    """The step along it may be large, but it gains nothing; `not_determined` names such an unknown."""
+
+    def flat(places):
+        return [Block("tracks", torch.stack([places[:, 0] - 0.5, 1e-3 * places[:, 1] + 1], -1)[:, :, None], _TWO)]
+
+    place = double([0.5, 0.5])
+    normal, _, _ = linearised(flat, lambda blocks: {"tracks": 1.0}, place)
+    assert peak(step_from(normal, place) - place) > 0.2
+    assert unsettled(normal, place, UNKNOWNS, NO_STEP) == ""
+
+
+_TWO = torch.arange(2)
+
+
+def test_the_expected_gain_is_that_of_linear_residuals():
+    def line(places):
+        return [Block("tracks", (places @ torch.tensor([[1.0, 2.0], [0.5, 0.1]]).double() - 0.3)[:, :, None], _TWO)]
+
+    place = double([0.2, 0.4])
+    normal, _, _ = linearised(line, lambda blocks: {"tracks": 10.0}, place)
+    target = step_from(normal, place)
+    after, _, _ = linearised(line, lambda blocks: {"tracks": 10.0}, target)
+    assert expected_gain(normal, target - place) == pytest.approx(1 - after.cost / normal.cost, abs=1e-6)
+
+
+def test_matches_reach_the_lowest_place_of_a_motion_that_soon_depends_on_everything():
+    """Phases that part with time: from afar, all frames at once end beside the true rate 0.7, growing parts do not."""
+
+    def end(steps):
+        place = double([0.67])
+        for stage, share in steps:
+            time = torch.linspace(0, 2, 49, dtype=torch.float64)[: max(3, round(share * 49))]
+
+            def swing(places, time=time):
+                found = torch.sin(60 * places * time.square()) - torch.sin(60 * 0.7 * time.square())
+                return [Block("tracks", torch.stack([found, 0 * found], -1), torch.arange(len(time)))]
+
+            progress = Progress(place)
+            while stage == "matches" and not progress.done and progress.iteration < 8:
+                iterate(swing, lambda blocks: SCALES, progress, 1e-5)
+            place = progress.place
+        return float(place[0])
+
+    fit = Fit.__new__(Fit)
+    fit.stages = ["tracks", "matches"]
+    assert end(fit.steps()) == pytest.approx(0.7, abs=1e-4)
+    assert end([("matches", 1.0)] * 3) != pytest.approx(0.7, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("stages", "steps"),
+    [
+        (["tracks"], "tracks 0.25 0.5 1"),
+        (["matches"], "matches 0.25 0.5 0.5 0.75 1 1"),
+        (["tracks", "matches"], "tracks 0.25 0.5 matches 0.5 0.5 0.75 1 1"),
+        (["tracks", "matches", "pixels"], "tracks 0.25 0.5 matches 0.5 0.5 0.75 1 1 pixels 1"),
+        (["tracks", "silhouettes", "matches"], "tracks 0.25 0.5 silhouettes 0.5 matches 0.5 0.5 0.75 1 1"),
+        (["tracks", "silhouettes", "pixels"], "tracks 0.25 0.5 1 silhouettes 1 pixels 1"),
+    ],
+)
+def test_no_stage_takes_more_time_than_is_exact_by_then(stages, steps):
+    fit = Fit.__new__(Fit)
+    fit.stages = stages
+    told = [
+        f"{stage} {' '.join(f'{share:g}' for _, share in own)}" for stage, own in groupby(fit.steps(), itemgetter(0))
+    ]
+    assert " ".join(told) == steps
+
+
+def test_a_camera_that_is_not_followed_is_named():
+    picture = torch.zeros(3, 3, 3, dtype=torch.uint8)
+    shown = [Shown("left", 24.8, 19.0, 40.7, picture, ("",)), Shown("right", 37.0, 36.0, 40.0, picture, ("",))]
+    result = Result(UNKNOWNS, (0.5, 0.5), 1e-4 * torch.eye(2), (), shown, (), 1.0)
+    assert result.astray == ["left"]
+    assert result.verdict == "failed"
+    (told,) = [line for line in result.text().splitlines() if "not followed" in line]
+    assert "16 dB worse" in told
+    assert "`until`" in told
+    assert replace(result, followed={"left": 0.99, "right": 0.99}).verdict == "good"  # its points say otherwise
+
+
+@pytest.mark.parametrize(
+    ("changes", "verdict", "words"),
+    [
+        ({}, "good", "This fit is good."),
+        ({"followed": {"left": 0.95, "right": 0.7}}, "doubtful", "camera right: the simulation explains 70% of"),
+        ({"followed": {"left": 0.95, "right": -1.8}}, "failed", "camera right: the simulation explains 0% of"),
+        ({"unsettled": "More `iterations`."}, "doubtful", "More `iterations`."),
+        ({"notes": ("Nothing moves.",)}, "doubtful", "Nothing moves."),
+        ({"rivals": ({"wind.speed": 9.0},)}, "doubtful", "Another start fits as well or better (wind.speed 9)"),
+        ({"place": (0.5, 1.0)}, "doubtful", "is at an end of its range"),
+        ({"covariance": torch.eye(2)}, "doubtful", "is not determined"),
+        ({"covariance": torch.diag(torch.tensor([0.0, 0.04]))}, "doubtful", "material.E is not determined"),
+    ],
+)
+def test_the_verdict_of_a_fit(changes, verdict, words):
+    good = Result(UNKNOWNS, (0.5, 0.5), 1e-4 * torch.eye(2), (), (), (), 1.0, followed={"left": 0.95})
+    result = replace(good, **changes)
+    assert result.verdict == verdict
+    assert words in result.text()
+
+
+@pytest.mark.slow
+def test_a_whole_fit_tells_it_and_goes_on(plan_of, tmp_path):
+    """One iteration is not enough; the same fit with more of them continues where it stood, and settles."""
+    pytest.importorskip("cv2", reason="needs the extra [fit]")
+    sought = {
+        "wind.speed": {"range": [2.0, 12.0], "start": 11.0}, "material.E": {"range": [2e3, 5e4], "start": 4e4}
+    }  # fmt: skip
+    plan = plan_of(sought, stages=["tracks"], search=0, iterations=1, tracks=40)
+    first = run_fit(plan, tmp_path / "fit", device="cpu", progress=False)
+    assert "not settled" in first.unsettled
+    assert first.unsettled in first.text()
+    assert json.loads((tmp_path / "fit/result.json").read_text())["not_settled"] == first.unsettled
+    again = run_fit(replace(plan, iterations=8), tmp_path / "fit", resume=True, device="cpu", progress=False)
+    assert again.history[: len(first.history)] == first.history
+    assert len(again.history) > len(first.history)
+    assert again.unsettled == ""
+    assert again.values["wind.speed"] == pytest.approx(5.0, rel=0.05)

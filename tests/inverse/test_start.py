@@ -1,0 +1,186 @@
+"""A film that is still at first or begins in motion: the time at which the motion starts is one more unknown."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import pytest
+import torch
+from shared import double, longest, peak
+from small_films import TRUTH
+
+from gaussian_swaying.inverse.evidence import TrackEvidence, compare, compare_starts
+from gaussian_swaying.inverse.fit import Course, Fit
+from gaussian_swaying.inverse.tracks import track
+from gaussian_swaying.inverse.unknowns import FILM_START, states_of
+from gaussian_swaying.inverse.videos import read_videos
+
+pytest.importorskip("cv2", reason="needs the extra [fit]")
+
+STILL, CUT = 4, 3  # frames
+SPEED, AZIMUTH = {"wind.speed": [2.0, 12.0]}, {"wind.azimuth": [-60.0, 150.0]}
+
+
+@pytest.fixture
+def late(own, tmp_path):
+    """The video of the flag after some frames in which nothing moves."""
+    folder = tmp_path / "late"
+    shutil.copytree(own / "video", folder)
+    file = folder / "transforms.json"
+    frames = json.loads(file.read_text())["frames"]
+    first = [frame for frame in frames if frame["time"] == 0]
+    moved = [frame | {"time": frame["time"] + STILL / 24} for frame in frames]
+    still = []
+    for k in range(STILL):
+        for frame in first:
+            name = f"still{k}_{frame['file_path']}"
+            shutil.copy(folder / frame["file_path"], folder / name)
+            still.append(frame | {"file_path": name, "time": k / 24})
+    file.write_text(json.dumps({"frames": [*still, *moved]}))
+    return folder
+
+
+@pytest.fixture
+def cut(own, tmp_path):
+    """The video of the flag without its first frames."""
+    file = own / "video/transforms.json"
+    frames = [frame for frame in json.loads(file.read_text())["frames"] if frame["time"] > (CUT - 0.5) / 24]
+    for frame in frames:
+        frame["time"] -= CUT / 24
+        for name in ("file_path", "mask_path"):
+            frame[name] = str(own / "video" / frame[name])
+    (tmp_path / "cut").mkdir()
+    (tmp_path / "cut/transforms.json").write_text(json.dumps({"frames": frames}))
+    return tmp_path / "cut"
+
+
+def test_the_start_of_the_motion_is_found(late, fitted, tmp_path):
+    result = fitted(SPEED | {"material.E": [2e3, 5e4], FILM_START: [0.0, 0.4]}, late, search=16)
+    assert result.values[FILM_START] == pytest.approx(STILL / 24, abs=0.004)
+    assert result.values["wind.speed"] == pytest.approx(TRUTH["wind.speed"], rel=0.02)
+    assert result.values["material.E"] == pytest.approx(TRUTH["material.E"], rel=0.02)
+    assert not result.notes
+    assert FILM_START in (tmp_path / "fit/scene.yaml").read_text()
+
+
+def test_a_start_that_is_missing_is_said(late, fit_of):
+    """And only there: the video that starts at once has no such note."""
+    (note,) = fit_of(SPEED, late).notes()
+    assert note.startswith("Nothing moves in the first 0.17 s of the film")
+    assert "film.start: {range: [0, 0.4]}" in note
+    assert fit_of(SPEED).notes() == fit_of(SPEED | {FILM_START: [0.0, 0.4]}, late).notes() == []
+
+
+def test_variants_that_start_at_other_times(simulation):
+    """Each is at rest until then, and moves as one that started at once."""
+    times = [k / 24 for k in range(5)]
+    early, late, between = zip(
+        *states_of(simulation, [{}, {FILM_START: 2 / 24}, {FILM_START: 0.5 / 24}], times), strict=True
+    )
+    assert torch.equal(late[2].position, early[0].position)
+    assert not torch.equal(between[1].position, early[0].position)
+    moved = longest(early[4].position - early[0].position)
+    assert longest(late[4].position - early[2].position) < 6e-3 * moved
+    assert [float(state.time) for state in between] == pytest.approx([0, 0.5 / 24, 1.5 / 24, 2.5 / 24, 3.5 / 24])
+
+
+def test_a_film_that_begins_in_motion(cut, fitted, tmp_path):
+    """The wind has blown for some frames; how long is found with the rest, and the note says that it is needed."""
+    result = fitted(SPEED | {"material.E": [2e3, 5e4], FILM_START: [-0.4, 0.2]}, cut, search=16, fit_share=0.8)
+    assert result.values[FILM_START] == pytest.approx(-CUT / 24, abs=0.004)
+    assert result.values["wind.speed"] == pytest.approx(TRUTH["wind.speed"], rel=0.02)
+    assert result.values["material.E"] == pytest.approx(TRUTH["material.E"], rel=0.03)
+    assert json.loads((tmp_path / "fit/fit.json").read_text())["course"]["first"]
+
+
+def test_rivals_of_a_film_in_motion_are_judged_by_the_points_of_their_own_first_frames(cut, fit_of, monkeypatch):
+    """Points that are followed from where a wrong wind has them speak for that wind; a fit goes on with the better."""
+    made, seen = fit_of(AZIMUTH | {FILM_START: [-0.2, 0.0]}, cut, search=0, iterations=1), []
+    sought = made.plan.unknowns
+    wrong = [sought[0].share(90.0), sought[1].share(-CUT / 24)]
+    true = [sought[0].share(TRUTH["wind.azimuth"]), wrong[1]]
+    shown = Fit._first_shown
+
+    def first_shown(self):
+        seen.append(list(self.first))
+        return shown(self)
+
+    monkeypatch.setattr(Fit, "_first_shown", first_shown)
+    made.first = wrong
+    monkeypatch.setattr("gaussian_swaying.inverse.fit.BRIEF", 0)  # where they are, not where they would go
+    ended, costs = made._each_from_its_own([wrong, true], "tracks")
+    assert seen == [wrong, true]
+    assert ended == [true, wrong]
+    assert costs[1] > 3 * costs[0]
+    assert made.first == wrong
+    made._trusted = lambda evidence, place: [
+        p.trusting(torch.full(p.tracks.seen.shape, 0.1 if place == wrong else 1.0)) for p in evidence
+    ]
+    less = dict(zip(*(map(str, part) for part in made._each_from_its_own([wrong, true], "tracks")), strict=True))
+    assert float(less[str(wrong)]) > float(less[str(true)])  # smaller residuals by less trust are no better fit
+    monkeypatch.setattr(made, "_others", lambda place, rivals: ([], [] if made.first == true else true))
+    del made._trusted
+    course = Course()
+    made.run(course, lambda course: None)
+    assert course.first == made.first == true
+
+
+@pytest.mark.parametrize("ends", [(-0.2, 0.0), (-0.2, 0.1), (-0.2, -0.05)])
+def test_the_place_that_a_film_in_motion_begins_from(cut, fit_of, ends):
+    """The wind whose simulation looks most like the first frame, and when it was so; not another wind's, nor rest."""
+    made = fit_of(AZIMUTH | {FILM_START: ends}, cut)
+    winds = (110.0, TRUTH["wind.azimuth"], -50.0)
+    places = double([[made.plan.unknowns[0].share(wind), 0.5] for wind in winds])
+    azimuth, start = made.values(made.begin_from(places)).values()
+    assert azimuth == pytest.approx(TRUTH["wind.azimuth"])
+    assert start == pytest.approx(-CUT / 24, abs=0.05)
+
+
+def test_a_changing_wind_in_a_film_in_motion_keeps_the_points(cut, fit_of, monkeypatch):
+    """Also of a fit that was continued: its own were not followed yet, and its place has no changes."""
+    made = fit_of(SPEED | {FILM_START: [-0.2, 0.0]}, cut)
+    made.first = [0.5, made.plan.unknowns[1].share(-CUT / 24)]
+    evidence = made.evidence("tracks")
+    made._tracks = None
+    monkeypatch.setattr(Fit, "solved", lambda self, place, evidence, times: list(place))
+    monkeypatch.setattr("gaussian_swaying.inverse.fit.PREFERRED", 2.0)
+    wider, _ = made._changed(made.first, evidence)
+    assert wider is not made
+    assert wider.tracks is made.tracks
+
+
+def test_a_film_in_motion_is_said(cut, fit_of):
+    """And nothing once the unknown is there."""
+    (note,) = fit_of(SPEED, cut).notes()
+    assert note.endswith("film.start: {range: [-1, 0]} to `unknowns`, or give a film that begins at rest.")
+    assert fit_of(SPEED | {FILM_START: [-0.4, 0.0]}, cut).notes() == []
+
+
+def test_variants_that_started_before_the_film(simulation):
+    times = [k / 24 for k in range(3)]
+    now, before = zip(*states_of(simulation, [{}, {FILM_START: -2 / 24}], times), strict=True)
+    assert torch.equal(before[0].position, now[2].position)
+    assert [float(state.time) for state in before] == pytest.approx([2 / 24, 3 / 24, 4 / 24])
+
+
+def test_starts_that_are_compared_at_once(own, simulation):
+    """One simulation shows what any start would: as simulations of each start do."""
+    (video, _) = read_videos(own / "video")
+    evidence = [TrackEvidence(simulation, video, track(simulation, video))]
+    times, starts = list(video.times[:5]), [-2 / 24, 0.0, 1 / 24]
+    together = compare_starts(simulation, evidence, [{"wind.speed": 4.0}], times, starts)
+    apart = [{"wind.speed": 4.0, FILM_START: start} for start in starts]
+    (block,) = compare(simulation, evidence, apart, times, careful=False, moving=True)
+    for number, (own_block,) in enumerate(together):
+        assert own_block.values[0].shape == block.values[number].shape
+        assert peak(own_block.values[0] - block.values[number]) < 0.02  # other steps
+    assert peak(together[0][0].values - together[1][0].values) > 1
+
+
+def test_gaussians_that_look_otherwise_are_not_seen(own, simulation):
+    """The picture of one state is followed to that of another; far from it, nothing that is found is trusted."""
+    (video, _) = read_videos(own / "video")
+    near = track(simulation, video, first=simulation.scene.rest())
+    assert near.seen[0].float().mean() > 0.8
+    blank = replace(video, images=torch.full_like(video.images, 128))
+    assert not track(simulation, blank, first=simulation.scene.rest()).seen[0].any()

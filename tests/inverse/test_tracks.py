@@ -1,0 +1,151 @@
+"""The tracker: pictures that are shifted by a known amount, and a simulation that is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from handheld_films import photographed
+from small_films import changed
+
+from gaussian_swaying.inverse.evidence import TrackEvidence
+from gaussian_swaying.inverse.tracks import _inside, drawn_beside, match, track, window_of
+from gaussian_swaying.inverse.unknowns import states_of
+from gaussian_swaying.inverse.videos import Footage, read_videos
+from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
+from gaussian_swaying.rendering.protocol import RenderOutput
+from gaussian_swaying.scenes.printed_cloth import printed_colours
+
+cv2 = pytest.importorskip("cv2", reason="needs the extra [fit]")
+
+
+@pytest.mark.parametrize(("size", "side"), [((200, 120), 15), ((540, 960), 15), ((1080, 1920), 29), ((3840, 2160), 57)])
+def test_the_window_grows_with_the_picture(size, side):
+    assert window_of(*size) == side
+
+
+def test_follow_a_shift():
+    from gaussian_swaying.inverse.tracks import follow
+
+    rows, columns = np.mgrid[0:80, 0:100].astype("f4")
+
+    def picture(x, y):
+        wave = np.sin(0.35 * (columns - x)) * np.cos(0.3 * (rows - y)) + np.sin(0.21 * (rows - y) + 0.1 * (columns - x))
+        return np.repeat((127 + 55 * wave)[..., None], 3, -1).round().astype("u1")
+
+    shifts = [(0.0, 0.0), (0.7, -0.4), (1.9, -0.9), (3.2, -1.1)]
+    start = np.stack(np.meshgrid(np.arange(25, 75, 10.0), np.arange(25, 55, 10.0)), -1).reshape(-1, 2)
+    position, seen = follow(np.stack([picture(*shift) for shift in shifts]), start)
+    assert seen.all()
+    for k, shift in enumerate(shifts):
+        assert np.abs(position[k] - start - shift).max() < 0.05
+
+
+def test_a_point_that_vanishes_is_lost():
+    from gaussian_swaying.inverse.tracks import follow
+
+    rng = np.random.default_rng(0)
+    picture = cv2.GaussianBlur(rng.integers(0, 255, (60, 60, 3), dtype="u1"), (7, 7), 0)
+    plain = np.full_like(picture, 128)
+    _, seen = follow(np.stack([picture, picture, plain]), np.array([[20.0, 20.0], [30.0, 40.0], [45.0, 25.0]]))
+    assert seen[1].all()
+    assert not seen[2].any()
+
+
+def test_matches_do_not_drift(own, simulation):
+    """Against the truth: tracks go astray by a pixel or so, matches from a nearby simulation by a part of that."""
+    videos = read_videos(own / "video")
+    times = list(videos[0].times)
+    truth = [states[0] for states in states_of(simulation, [{}], times)]
+    near = [states[0] for states in states_of(simulation, [{"wind.speed": 4.7, "material.E": 1.2e4}], times)]
+    for video in videos:
+        tracks, matches = track(simulation, video), match(simulation, video, near)
+        off = {}
+        for name, found in (("tracks", tracks), ("matches", matches)):
+            evidence = TrackEvidence(simulation, video, found)
+            parts = [evidence.residuals(simulation, [truth[k]], k)[0][0] for k in range(4, len(times))]
+            off[name] = float(torch.cat(parts).norm(dim=-1).median())
+        assert off["matches"] < 0.25
+        assert off["matches"] < off["tracks"] < 2
+
+
+def test_a_shift_that_is_there_at_rest_is_taken_off_matches(own, simulation):
+    """The same video, said to be from cameras whose pictures are shifted by a part of a pixel."""
+    video = read_videos(own / "video")[0]
+    turned = []
+    for camera in video.cameras:
+        intrinsics = camera.intrinsics.clone()
+        intrinsics[:2, 2] += torch.tensor([0.6, -0.4])
+        turned.append(replace(camera, intrinsics=intrinsics))
+    times = video.times[:5]
+    states = [found[0] for found in states_of(simulation, [{}], times)]
+    video = replace(video, cameras=tuple(turned))
+    evidence = TrackEvidence(simulation, video, match(simulation, video, states))
+    for k in range(len(times)):  # the simulation is the truth
+        off = evidence.residuals(simulation, [states[k]], k)[0][0].median(0).values
+        assert off.tolist() == pytest.approx([0.0, 0.0], abs=0.05)
+
+
+def _printed(folder, spacing):
+    """Simulation of a printed flag, 0.4 m x 0.3 m."""
+    flag = {"width": 0.4, "height": 0.3, "spacing": spacing, "ripple": 0.0, "pattern": "printed", "overlap": 0.5}
+    return changed(folder, scene={"generator": {"class_path": "FlagScene", "init_args": flag}})
+
+
+def _photographed(camera):
+    """A picture of the printed sheet itself, uint8, (H, W, 3)."""
+    sheet = (0.4, 0.3, 0.0, (0.0, 0.0, 0.0))
+    return (255 * photographed(camera, [sheet], 3, printed_colours)).round().to(torch.uint8)
+
+
+@pytest.mark.slow(gate=["False"])
+@pytest.mark.parametrize("real", [True, False])
+def test_matches_are_not_shifted_where_the_print_of_a_splat_is(real, tmp_path):
+    """Cameras on both sides of a flag at rest, from which the print of its splat is shifted to opposite sides.
+
+    A video of the thing itself shows its print where it is; one that the splat made shows what the simulation shows.
+    """
+    simulation = _printed(tmp_path, 0.01)
+    painter, gaussians = simulation.painter, simulation.scene.rest()
+    views = [look_at_camera((0.2 + x, -0.5, 0.35), (0.2, 0.0, 0.15), (0, 0, 1), 45.0, 240, 180) for x in (-0.5, 0.5)]
+    drawn = [painter.picture(gaussians, view).color.detach() for view in views]
+    own = [(255 * picture.clamp(0, 1)).round().to(torch.uint8) for picture in drawn]
+    images = [_photographed(view) for view in views] if real else own
+    rest = next(iter(states_of(simulation, [{}], [0.0])))[0]
+    found = match(simulation, Footage("moved", (0.0, 0.1), tuple(views), torch.stack(images)), [rest, rest])
+    means = simulation.scene.model.means.detach()[simulation.scene.moving[found.index]]
+    for k, view in enumerate(views):
+        pixel = project(means, view)[0]
+        off = (found.position[k] - pixel)[found.seen[k]].median(0).values
+        beside = drawn_beside(painter, gaussians, view, pixel)[found.seen[k]].median(0).values
+        assert beside.norm() > 0.5
+        assert off.norm() < 0.1
+
+
+def test_points_from_a_picture_of_the_splat_are_where_the_thing_has_them(tmp_path):
+    """A film of the thing shows what the splat draws beside its places where it is; one of the splat does not."""
+    simulation = _printed(tmp_path, 0.01)
+    rest, view = simulation.scene.rest(), look_at_camera((0.7, -0.5, 0.35), (0.2, 0.0, 0.15), (0, 0, 1), 45.0, 240, 180)
+    footage = Footage("moved", (0.0, 0.1), (view, view), _photographed(view).expand(2, -1, -1, -1))
+    means = rest.means[simulation.scene.moving]
+    found = {}
+    for itself in (True, False):
+        tracks = track(simulation, replace(footage, itself=itself), first=rest)
+        off = (tracks.position - project(means[tracks.index], view)[0]).norm(dim=-1)
+        found[itself] = [float(off[k][tracks.seen[k]].median()) for k in range(2)]
+        assert tracks.seen[1].sum() > 20
+    assert max(found[True]) < 0.5 * min(found[False])
+    assert min(found[False]) > 0.5
+
+
+def test_windows_over_the_border_are_left_out_unless_the_thing_is_thin():
+    """Of a square of 60 pixels, and of a stripe of 8."""
+    places = torch.cartesian_prod(torch.arange(2.5, 100, 5), torch.arange(2.5, 100, 5)).double()
+    for low, high, thin in ((20, 80, False), (46, 54, True)):
+        alpha = torch.zeros(100, 100, 1)
+        alpha[:, low:high] = 1
+        alpha[:20], alpha[80:] = 0, 0
+        picture = RenderOutput(torch.zeros(100, 100, 3), alpha, torch.ones(100, 100, 1))
+        on = alpha[places[:, 1].long(), places[:, 0].long(), 0] > 0
+        inside = _inside(places, picture, on)
+        assert torch.equal(inside, on if thin else (places > 27).all(-1) & (places < 73).all(-1))
