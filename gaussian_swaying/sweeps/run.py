@@ -113,7 +113,9 @@ class Outcome:
 
 @cache
 def _parser() -> ArgumentParser:
-    return Simulation.parser()
+    parser = Simulation.parser()
+    gc.freeze()  # loky and `work` look for garbage after each run, which would take as long as a frame or two
+    return parser
 
 
 def work(job: Job, threads: int, explain: Explain, where: str = platform.node()) -> Outcome:
