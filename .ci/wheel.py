@@ -155,6 +155,7 @@ def main() -> None:
     works("sweep sweep.yaml --device=cpu --workers=1 --output=sweep", "sweep/sweep.csv", "sweep/contact_sheet.png")
     needs("parquet", "sweep sweep.yaml --parquet --output=other")
     needs("ray", "sweep sweep.yaml --ray --output=other")
+    needs("webdataset", "sweep sweep.yaml --shards=2 --output=other")
     tried.add("sweep")
     works(["train", "fit", "--config=quick_cpu", *words(BRIEF)], "outputs/train/quick_cpu/point_cloud.ply")
     tried.add("train")
