@@ -5,6 +5,7 @@ from gaussian_swaying.kernels.language import tl, triton
 
 ROUNDS = tl.constexpr(32)  # most rounds of the equations for the drag
 LEFT = tl.constexpr(1e-10)  # square of what they may leave, as a share
+TALL = tl.constexpr(4)  # rows of the drag that are summed together
 
 
 @triton.jit
@@ -93,17 +94,24 @@ def modal_load(shapes, forces, load, sites, count, BLOCK: tl.constexpr):
 
 @triton.jit(do_not_specialize=("count", "sites"))
 def modal_drag(shapes, forces, drag, sites, count, BLOCK: tl.constexpr):
-    """Half of the drag of the modes, by the seventh of eight numbers of each site; rows along the second axis."""
-    i = tl.program_id(1)
+    """Half of the drag of the modes, by the seventh of eight numbers of each site; TALL rows along the second axis."""
+    first = tl.program_id(1) * TALL
     m = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = m < count
-    found = tl.zeros([BLOCK], tl.float32)
+    zero = tl.zeros([BLOCK], tl.float32)
+    a, b, c, d = zero, zero, zero, zero
     for s in range(0, sites):
         half = 0.5 * tl.load(forces + 8 * s + 6)
-        for c in tl.static_range(3):
-            row = shapes + (3 * s + c) * count
-            found += half * tl.load(row + i) * tl.load(row + m, mask, 0.0)
-    tl.store(drag + i * count + m, found, mask)
+        for k in tl.static_range(3):
+            row = shapes + (3 * s + k) * count
+            whole = half * tl.load(row + m, mask, 0.0)
+            a += tl.load(row + first) * whole
+            b += tl.load(row + first + 1, first + 1 < count, 0.0) * whole
+            c += tl.load(row + first + 2, first + 2 < count, 0.0) * whole
+            d += tl.load(row + first + 3, first + 3 < count, 0.0) * whole
+    found = (a, b, c, d)
+    for k in tl.static_range(TALL):
+        tl.store(drag + (first + k) * count + m, found[k], mask & (first + k < count))
 
 
 @triton.jit(do_not_specialize=("count",))

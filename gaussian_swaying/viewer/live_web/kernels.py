@@ -146,7 +146,16 @@ def pack_modes(
                 loads.buffer, out, sites, sites, 1, 0, FORCES=loads.layout,
             )  # fmt: skip
             note(name, modal.modal_load, (blocks,), shapes, out, load, sites, count)
-            note(f"{name}Drag", modal.modal_drag, (blocks, count), shapes, out, drag, sites, count)
+            note(
+                f"{name}Drag",
+                modal.modal_drag,
+                (blocks, -(-count // modal.TALL.value)),
+                shapes,
+                out,
+                drag,
+                sites,
+                count,
+            )
         note("swing", modal.modal_swing, (1,), q, p, load, drag, factor, left, lost, count)
         omega, settings = bound.square.sqrt(), bound.settings
         ratio = bound.ratio - (settings.damping / omega + settings.stiffness_damping * omega) / 2  # of the material

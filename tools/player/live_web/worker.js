@@ -37,8 +37,7 @@ const queue = (/** @type {() => any} */ task) => (chain = chain.then(task).catch
 
 /** Says what computes, and why it is not WebGPU, once that is known. @param {string | null} why */
 function tell(why = null) {
-  const name = solver.gpu ? "webgpu" : solver instanceof Solver ? "webassembly" : "javascript";
-  post({ kind: "solver", name, why });
+  post({ kind: "solver", name: solver.gpu ? "webgpu" : "webassembly", why });
 }
 
 /** The motion goes on in a graphics card, or with null in the processor. @param {any} gpu @param {string | null} why */
@@ -195,7 +194,7 @@ const does = {
     let substeps = 0;
     for (let k = 0; k < count; k++) substeps += await forward();
     show();
-    post({ kind: "done", gpu: !!solver.gpu, kernels: solver instanceof Solver && !solver.gpu, substeps, seconds: (performance.now() - began) / 1000, simulated: count * solver.head.frameDt });
+    post({ kind: "done", gpu: !!solver.gpu, kernels: !solver.gpu, substeps, seconds: (performance.now() - began) / 1000, simulated: count * solver.head.frameDt });
   },
   lose() {
     solver.gpu?.device.destroy();
