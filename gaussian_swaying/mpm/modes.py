@@ -23,9 +23,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._devices import in_double
-from gaussian_swaying.geometry.linalg import vectors
-from gaussian_swaying.geometry.rotations import rotation_of
-from gaussian_swaying.kernels.derive import on_tensors
+from gaussian_swaying.geometry.rotations import rodrigues, rotation_of
 from gaussian_swaying.kernels.launch import lanes, launch, replaces
 from gaussian_swaying.mpm.boundary import Boundary
 from gaussian_swaying.mpm.contact import Surface
@@ -34,7 +32,6 @@ from gaussian_swaying.mpm.device_functions import DeviceFunction, Packed
 from gaussian_swaying.mpm.forces import Force, added, split, tensors_of
 from gaussian_swaying.mpm.formulation import Settings, flowing
 from gaussian_swaying.mpm.modal import Analysis, analysis_of
-from gaussian_swaying.mpm.modal_kernels import amplitude, factors, warp
 from gaussian_swaying.mpm.pins import PinnedPoints, PinnedRegion, RigidRegion
 from gaussian_swaying.mpm.shared_kernels import site_forces
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState, State
@@ -292,9 +289,9 @@ class Modes(Total):
         acting = [] if kernel else [(one, one.during(middle, dt, steps)) for one in groups if one is not None]
         square, inertia, ratio = self.square, self.inertia, self.ratio
         alpha = ratio * square.sqrt()
-        swing = on_tensors(factors)(square, alpha, dt)
-        gain = (swing[1] / inertia).to(q)  # of the velocity by a load
-        own = [x.to(q) for x in swing]
+        decay, sine, cosine = _oscillation(square, alpha, dt)
+        gain = (decay * sine / inertia).to(q)  # of the velocity by a load
+        own = [x.to(q) for x in (decay * (cosine + alpha * sine), decay * sine, decay * (cosine - alpha * sine))]
         back, still = square.to(q) * own[1], (square * inertia).to(q)
         gravity = self.gravity.to(q)
         work, impulse, drag, solve = state.work, state.impulse, None, None
@@ -328,7 +325,8 @@ class Modes(Total):
             if drag is not None:
                 lost = 0.5 * _product(drag, new - p)
                 outer, pulled = outer - lost, pulled - lost
-            after = on_tensors(amplitude)(q, p, pulled / still, own[0], own[1])
+            rest = pulled / still
+            after = rest + own[0] * (q - rest) + own[1] * p
             work = work + in_double(outer * (after - q)).sum(-1)
             mean = 0.5 * (q + after)
             taken = (self.reaction @ mean[..., None, :, None])[..., 0] + self.direct @ load
@@ -464,7 +462,14 @@ def warped(turn: Tensor, shift: Tensor) -> Tensor:
     Returns:
         Shape (..., 3).
     """
-    return vectors(on_tensors(warp)(turn.unbind(-1), shift.unbind(-1)))
+    _, cosine = rodrigues(turn)  # (1 - cos a) / a²
+    first = torch.linalg.cross(turn, shift)
+    square = turn.square().sum(-1, keepdim=True)
+    small = square < 1e-2
+    safe = torch.where(small, torch.ones_like(square), square)
+    angle = safe.sqrt()
+    cubic = torch.where(small, 1 / 6 - square / 120 + square.square() / 5040, (1 - torch.sin(angle) / angle) / safe)
+    return shift + cosine * first + cubic * torch.linalg.cross(turn, first)
 
 
 def _vectors(shape: Tensor, amplitudes: Tensor) -> Tensor:
@@ -478,6 +483,20 @@ def _turned(R: Tensor, vectors: Tensor) -> Tensor:
 
 def _product(matrix: Tensor, vector: Tensor) -> Tensor:
     return (matrix @ vector[..., None])[..., 0]
+
+
+def _oscillation(square: Tensor, alpha: Tensor, dt: float) -> tuple[Tensor, Tensor, Tensor]:
+    r"""Decay :math:`e^{-\alpha t}`, :math:`\sin(\omega_d t) / \omega_d` and :math:`\cos(\omega_d t)` of damped modes.
+
+    Modes that are damped more than critically have hyperbolic functions.
+    """
+    apart = square - alpha.square()
+    rate = apart.abs().clamp(min=1e-12).sqrt()
+    over = apart < 0
+    angle = (rate * dt).clamp(max=300.0)
+    sine = torch.where(over, torch.sinh(torch.where(over, angle, 0.0)), torch.sin(angle)) / rate
+    cosine = torch.where(over, torch.cosh(torch.where(over, angle, 0.0)), torch.cos(angle))
+    return torch.exp(-alpha * dt), sine, cosine
 
 
 class SiteForces:

@@ -1,7 +1,7 @@
 """The block of bytes that the solver in a browser needs, and the scenes that it cannot simulate.
 
 The block is the length of its head (uint32, little-endian), the head in JSON, and the arrays that the head lists, in
-float32 or whole numbers. The solvers are ``solver.js``, ``webgpu.js`` and ``modal.js`` in ``tools/player/live_web``;
+float32 or whole numbers. The solvers are ``kernels.js``, ``webgpu.js`` and ``modal.js`` in ``tools/player/live_web``;
 their definitions are :mod:`~gaussian_swaying.mpm.total` and :mod:`~gaussian_swaying.mpm.modes`.
 """
 
@@ -16,17 +16,19 @@ from torch import Tensor
 
 from gaussian_swaying.kernels.launch import compiles
 from gaussian_swaying.mpm.colliders import Obstacle
-from gaussian_swaying.mpm.modes import LONGEST, PER_PERIOD, SHORTEST, Modes
+from gaussian_swaying.mpm.modes import Modes
 from gaussian_swaying.mpm.pins import PinnedPoints, PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.total import Total
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.film.page import message
-from gaussian_swaying.viewer.live_web.kernels import pack_modes, pack_total
+from gaussian_swaying.viewer.live_web.kernels import pack_kernels
 from gaussian_swaying.viewer.live_web.longest import longest_courant
-from gaussian_swaying.wind.effects import Obstacle as Past
-from gaussian_swaying.wind.field import GaussianGust, SineSway, UniformGust, WindField
-from gaussian_swaying.wind.tables import CarriedField
+from gaussian_swaying.wind.effects import Moment
+from gaussian_swaying.wind.field import GaussianGust, SineSway, UniformGust, WindField, stream_start
+from gaussian_swaying.wind.force import LAWS as AERO_LAWS
+from gaussian_swaying.wind.force import WindForce
+from gaussian_swaying.wind.turbulence import Turbulence
 
 
 def check(simulation: Simulation) -> None:
@@ -49,29 +51,24 @@ def check(simulation: Simulation) -> None:
         raise _refused("`edits`", "leave them out")
     if simulation.stepper.joints:
         raise _refused("joints of `scene.parts`", "leave out `joint_stiffness` and `joint_turning` of its parts")
-    if sways and model.aero.carried:
+    if model.aero.carried:
         raise _refused("the air that the material carries", "set `aero.added_mass` to 0")
     if model.air is not None:
         raise _refused("computed air", "set `air` to null")
-    for force in model.forces:
-        function = force.device_function()
-        if sways or function is None or function.per_substep.count:
-            raise _refused(f"the {type(force).__name__} in `forces`", "leave it out")
+    if model.forces:
+        raise _refused("`forces` of your own", "leave them out")
     wind = model.wind
-    if type(wind) is not WindField:
-        raise _refused(f"the {type(wind).__name__} in `wind`", "take a WindField")
-    for effect in wind.effects:
-        function = effect.device_function()  # type: ignore[operator]
-        known = type(effect) is Past or (isinstance(effect, CarriedField) and type(effect).now is CarriedField.now)
-        if function is None or (function.per_substep.count and not known):
-            raise _refused(f"the {type(effect).__name__} in `wind.effects`", "leave it out")
+    stirred = sways and isinstance(wind, WindField) and list(map(type, wind.effects)) == [Turbulence]
+    if type(wind) is not WindField or not (wind.uniform or stirred):
+        remedy = "leave out `wind.effects`, of which `solver.formulation: modes` takes one Turbulence"
+        raise _refused("a wind that differs from place to place", remedy)
     for modulation in wind.modulations:
         if type(modulation) not in (SineSway, UniformGust, GaussianGust):
             raise _refused(f"the {type(modulation).__name__} in `wind.modulations`", "leave it out")
-    if not compiles("cpu") or model.points.position.dtype != torch.float32:
-        raise _refused("what its kernels are not compiled for", "install llvmlite, and set `dtype` to float32")
     if sways:  # it checks the rest itself
         return
+    if not compiles("cpu") or model.points.position.dtype != torch.float32:
+        raise _refused("what its kernels are not compiled for", "install llvmlite, and set `dtype` to float32")
     for law in model.points.laws:
         if law.device is None:
             raise _refused(f"the law {type(law).__name__} in `material.law`", "take one with device functions")
@@ -108,47 +105,64 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
     assert isinstance(solver, MPMSolver)
     bound = solver.bound
     assert isinstance(bound, Total)
-    settings, scene, stepper = bound.settings, simulation.scene, simulation.stepper
-    force, wind = stepper.wind_force, simulation.wind
-    assert isinstance(wind, WindField)
-    head: dict[str, Any] = {
+    settings, scene = bound.settings, simulation.scene
+    head = {
         "dx": settings.dx,
+        "gravity": list(settings.gravity),
         "damping": settings.damping,
         "viscous": settings.stiffness_damping,
         "substep": solver.substep,
         "frameDt": simulation.frame_dt,
         "size": scene.size * scene.frame.metres_per_unit,
-        "idle": stepper.idle,
+        "idle": simulation.stepper.idle,
+        "wind": _wind(simulation.wind),
     }
     if isinstance(bound, Modes):
-        here = None if stepper.idle else force.on_sites(bound.site, bound.sites)
-        more, arrays = pack_modes(bound, here, wind, len(nodes))
-        head |= {"modes": True, "substeps": [LONGEST, SHORTEST, 2 * math.pi / bound.first / PER_PERIOD]}
-        return _joined(head | more, arrays | _shapes(bound, nodes))
-    more, arrays = pack_total(bound, stepper.forces, wind)
+        return _pack_modes(head, simulation, bound, nodes)
+    force = simulation.stepper.wind_force
+    head |= {"cfl": solver.cfl, "longest": max(solver.cfl, longest_courant(bound))}
+    kernels, more = pack_kernels(bound, None if head["idle"] else force)
+    head |= {"kernels": kernels, "bending": float(bound.bending_rate) * settings.dx**2 / 6}
     mass = bound.points.mass
-    explicit = not stepper.idle and force.aero.drag_step == "explicit"
+    explicit = not head["idle"] and force.aero.drag_step == "explicit"
     rate = force.aero.rate(torch.ones_like(mass), force.area, mass) if explicit else mass[:0]
-    head |= {
-        "cfl": solver.cfl,
-        "longest": max(solver.cfl, longest_courant(bound)),
-        "bending": float(bound.bending_rate) * settings.dx**2 / 6,
-    }
-    return _joined(head | more, arrays | {"mass": mass, "rate": rate, "followed": nodes})
+    arrays = {"mass": mass, "rate": rate, "followed": nodes}
+    return _joined(head, arrays | more)
 
 
-def _shapes(bound: Modes, nodes: Tensor) -> dict[str, Tensor]:
-    """The shapes of the modes on the sites and on some nodes, in small whole numbers."""
+def _pack_modes(head: dict[str, Any], simulation: Simulation, bound: Modes, nodes: Tensor) -> bytes:
+    """The block of a body that sways by its modes, with shapes in small whole numbers."""
+    force = simulation.stepper.wind_force.on_sites(bound.site, bound.sites)
     omega = bound.square.sqrt()
     every = [bound._everywhere(x.unflatten(-2, (-1, 3)).flatten(-2))[nodes] for x in (bound.shape, bound.turn)]
-    shown = torch.cat([x.reshape(-1, len(omega)) for x in every])
-    arrays = {"omega": omega, "mass": bound.site_mass, "order": torch.arange(bound.sites)}
-    for name, shape in {"sites": bound.site_modes, "nodes": shown}.items():
-        scaled = shape.double() / omega  # loads of one size move a mode by 1 / omega^2, at a rate of 1 / omega
+    shapes = dict(zip(("siteShape", "siteTurn"), bound.site_modes.chunk(2, -2), strict=True))
+    shapes |= dict(zip(("nodeShape", "nodeTurn"), (x.reshape(-1, len(omega)) for x in every), strict=True))
+    arrays = {
+        "omega": omega,
+        "ratio": bound.ratio - (head["damping"] / omega + head["viscous"] * omega) / 2,  # that of the material
+        "rest": bound.site_rest,
+        "mass": bound.site_mass,
+        **_wind_arrays(force),
+    }
+    for name, shape in shapes.items():  # loads of one size move a mode by 1 / omega^2, at a rate of 1 / omega
+        scaled = shape.double() / omega
         largest = scaled.abs().amax(-1, keepdim=True)  # that of a speck may be a hundred times the usual one
         step = (largest / 32767).clamp(min=float(largest[largest > 0].median()) / 256)
         arrays |= {name: (scaled / step).round().short(), f"{name}Step": step}
-    return arrays
+    wind = simulation.wind
+    assert isinstance(wind, WindField)
+    for effect in wind.effects:
+        assert isinstance(effect, Turbulence)
+        unit = float(effect.table.abs().max()) / 64
+        arrays["turbulence"] = (effect.table / unit).round().char()
+        head["wind"]["turbulence"] = {
+            "cells": list(effect.table.shape[:3]),
+            "axes": effect.axes.tolist(),
+            "side": effect.spacing[0],
+            "offset": effect.now(Moment(*torch.zeros(3, 1, 3, dtype=torch.float64)))[0, :3].tolist(),
+            "scale": effect.scale * unit,
+        }
+    return _joined(head | {"modes": list(shapes), "period": 2 * math.pi / bound.first, "aero": _aero(force)}, arrays)
 
 
 def _joined(head: dict[str, Any], arrays: dict[str, Tensor]) -> bytes:
@@ -158,3 +172,40 @@ def _joined(head: dict[str, Any], arrays: dict[str, Tensor]) -> bytes:
         listed.append([name, kind, values.numel()])
         blocks.append(values.detach().cpu().contiguous().numpy().astype(np.dtype("<" + kind)).tobytes())
     return message(head | {"arrays": listed}, *blocks)
+
+
+def _aero(force: WindForce) -> dict[str, Any]:
+    aero = force.aero
+    return {
+        "drag": float(aero.C_D),
+        "friction": float(aero.C_F),
+        "lift": float(aero.C_L),
+        "airDensity": aero.air_density,
+        "law": AERO_LAWS.index(aero.law),
+        "implicit": aero.drag_step == "semi_implicit",
+        "maxAreaRatio": None if aero.max_area_ratio == math.inf else aero.max_area_ratio,
+    }
+
+
+def _wind_arrays(force: WindForce) -> dict[str, Tensor]:
+    """The patches of each site: area vectors and the sum of A N N^T."""
+    sums = force.sums
+    assert sums is not None
+    ends = sums.point.bincount(minlength=len(force.area)).cumsum(0)
+    upper = sums.tensor[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    first = torch.cat([ends.new_zeros(1), ends])
+    return {"area": force.area, "tensor": upper, "firstVector": first, "vectors": sums.vector}
+
+
+def _wind(wind: Any) -> dict[str, Any]:
+    parts: list[dict[str, Any]] = []
+    for stream, part in enumerate(wind.modulations):
+        start = str(int(stream_start(wind.seed, stream)))  # of 64 bits
+        if isinstance(part, SineSway):
+            parts.append({"kind": "sway", "amplitude": part.amplitude, "period": part.period, "phase": part.phase})
+        elif isinstance(part, UniformGust):
+            parts.append({"kind": "uniform", "delta": part.delta, "interval": part.interval, "start": start})
+        else:
+            parts.append({"kind": "gaussian", "std": part.std, "interval": part.interval, "start": start})
+    linear = wind.interpolation == "linear"
+    return {"times": wind.times.tolist(), "flows": wind.flows.tolist(), "linear": linear, "modulations": parts}

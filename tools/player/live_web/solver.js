@@ -1,4 +1,5 @@
-// A body by the material point method in its total Lagrangian form; its frames are those of gaussian_swaying/simulation/step.py.
+// A body by the material point method in its total Lagrangian form, by the package's own kernels in WebAssembly, which
+// gaussian_swaying/viewer/live_web/kernels.py writes into the block. Its frames are those of gaussian_swaying/simulation/step.py.
 import { Body } from "./body.js";
 
 export const LOOKS = 8; // checks of the Courant number in a frame
@@ -14,19 +15,38 @@ export class Solver extends Body {
   /** @param {{head: any, arrays: Record<string, any>}} block Throws an Error where the browser has no such WebAssembly. */
   constructor(block) {
     super(block);
+    const { image, fusedCode, plainCode } = block.arrays;
+    const { start, places } = block.head.kernels;
+    if (!globalThis.WebAssembly?.validate(plainCode)) throw new Error("this browser has no WebAssembly with SIMD");
+    const memory = new WebAssembly.Memory({ initial: Math.ceil((start + image.length) / 65536) });
+    const stack = new WebAssembly.Global({ value: "i32", mutable: true }, start);
+    const env = { __linear_memory: memory, __stack_pointer: stack, fmaxf: Math.max, sinf: Math.sin, cosf: Math.cos };
+    const code = new WebAssembly.Module(WebAssembly.validate(fusedCode) ? fusedCode : plainCode);
+    this.kernels = /** @type {any} */ (new WebAssembly.Instance(code, { env }).exports);
+    new Uint8Array(memory.buffer).set(image, start);
+    const view = ([first, bytes], Kind = Float32Array) => new Kind(memory.buffer, first, bytes / Kind.BYTES_PER_ELEMENT);
+    this.tables = Object.fromEntries(Object.entries(places).map(([name, place]) => [name, view(place)]));
+    this.first = view(places.first, Int32Array); // substep within the tables
+    this.clock = view(places.clock, Float64Array);
+    this.length = view(places.step, Float64Array);
     this.moduli = this.tables.material.slice(this.points, 3 * this.points);
     this.curving = this.tables.curving?.slice(); // the square of which is a stiffness
     this.before = this.tables.fields.slice();
+    this.blown = new Float64Array(3);
+    /** Computes substeps in place of this processor. @type {import("./webgpu.js").Gpu | null} */
+    this.gpu = null;
     this.steps = null; // of the first frame
     this.reset();
   }
 
   /** Back to rest. */
   reset() {
-    super.reset();
     this.tables.fields.fill(0);
     this.tables.velocity.fill(0);
+    this.time = 0;
     this.substep = 0; // the last one [s]
+    this.pull = null;
+    this.hurried = false;
     /** The last measurement: when, the square of the fastest wave [m²/s²], and that of the largest stretch. */
     this.seen = { time: NaN, wave: 0, stretch: 1 };
   }
@@ -54,8 +74,7 @@ export class Solver extends Body {
     const cfl = this.hurried ? this.head.longest : this.head.cfl;
     const { fields } = this.tables;
     this.before.set(fields);
-    const [time, substep, come] = [this.time, this.substep, this.wind.come];
-    this.wind.come = [...come];
+    const [time, substep] = [this.time, this.substep];
     if (this.seen.time !== time) this.measure();
     let steps = this.substeps(cfl);
     this.steps ??= steps;
@@ -70,7 +89,7 @@ export class Solver extends Body {
       const growth = Number.isFinite(courant) ? courant / cfl : 4;
       steps = Math.floor(steps * Math.min(growth * 1.1, 4)) + 1;
       fields.set(this.before);
-      [this.time, this.substep, this.wind.come] = [time, substep, [...come]];
+      [this.time, this.substep] = [time, substep];
     }
   }
 
@@ -86,11 +105,13 @@ export class Solver extends Body {
 
   /** The largest rate of drag on a patch in the next frame [1/s]. */
   drag() {
+    const { blown } = this;
     const { velocity } = this.tables;
-    const times = Array.from({ length: SAMPLES }, (_, k) => this.time + (k * this.head.frameDt) / (SAMPLES - 1));
-    const air = this.wind.blow(times);
-    const blowing = Math.max(...times.map((_, k) => Math.hypot(...air.subarray(3 * k, 3 * k + 3))));
-    let largest = 0;
+    let [blowing, largest] = [0, 0];
+    for (let k = 0; k < SAMPLES; k++) {
+      this.wind.blow(this.time + (k * this.head.frameDt) / (SAMPLES - 1), blown);
+      blowing = Math.max(blowing, Math.hypot(...blown));
+    }
     this.a.rate.forEach((rate, p) => {
       const speed = Math.hypot(velocity[3 * p], velocity[3 * p + 1], velocity[3 * p + 2]);
       largest = Math.max(largest, rate * (blowing + speed));
@@ -127,12 +148,12 @@ export class Solver extends Body {
     for (let k = 0; k < steps; k++) {
       if (k > 0 && k % every === 0) far();
       if (k % MOST === 0) this.write(dt, Math.min(MOST, steps - k));
-      this.tables.first[0] = k % MOST;
-      this.tables.clock[0] = this.time;
+      this.first[0] = k % MOST;
+      this.clock[0] = this.time;
       run();
       this.time += dt;
     }
-    this.tables.first[0] = 0;
+    this.first[0] = 0;
     far();
     this.kernels.read();
     return farthest;
@@ -153,19 +174,37 @@ export class Solver extends Body {
 
   /** Writes the tables of the next substeps of `dt` [s]. */
   write(dt, steps) {
-    const { tables, head, points } = this;
+    const { tables, head, points, pull } = this;
+    const { widths, pull: [row, column] } = head.kernels;
+    const width = widths[pull ? 1 : 0];
     for (let k = 0; k < steps; k++) {
       const kick = this.substep > 0 ? Math.min(0.5 * (this.substep + dt), 2 * dt) : dt; // how long forces act
       tables.schedule.set([kick, dt, Math.exp(-head.damping * kick)], TIMES * (k + 1));
+      if (!this.idle) {
+        this.wind.blow(this.time + k * dt, this.blown);
+        tables.winds.set(this.blown, width * k);
+      }
+      if (pull) tables.winds.set(pull.target, width * k + column);
       this.substep = dt;
     }
-    tables.step[0] = dt;
+    this.length[0] = dt;
     tables.material.set(this.moduli.map((x) => x * this.stiffness), points);
     tables.curving?.set(this.curving.map((x) => x * Math.sqrt(this.stiffness)));
-    this.blow(Array.from({ length: steps }, (_, k) => this.time + k * dt));
+    if (!pull) return;
+    const values = tables.values.subarray(points * row);
+    this.a.order.forEach((own, p) => {
+      for (let m = 0; m < 3; m++) values[m * points + p] = pull.offset[3 * own + m];
+      values[3 * points + p] = pull.held[own];
+    });
   }
 
   // ---- what is seen
+
+  /** Places of all points [m]. */
+  positions(to) {
+    this.kernels.read();
+    to.set(this.tables.position);
+  }
 
   /** Displacements of the nodes that Gaussians follow [m], four numbers each. */
   drawn() {

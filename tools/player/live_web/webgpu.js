@@ -53,13 +53,13 @@ export class Gpu {
     this.broken = null;
     device.lost.then(({ message }) => (this.broken ??= message || "its device was lost"));
     device.onuncapturederror = ({ error }) => (this.broken ??= error.message);
-    this.place = (/** @type {string} */ name) => [places[name][0] - start, 4 * places[name][1]];
+    this.place = (/** @type {string} */ name) => [places[name][0] - start, places[name][1]];
     const usage = globalThis.GPUBufferUsage;
     const make = (bytes, use) => device.createBuffer({ size: bytes, usage: use | usage.COPY_DST });
     this.memory = make(size, usage.STORAGE | usage.COPY_SRC);
     this.peaks = make(8, usage.STORAGE | usage.COPY_SRC);
     this.counts = make(STRIDE * MOST, usage.UNIFORM);
-    this.found = make(4 * (places.fields[1] + places.velocity[1]) + 8 * (LOOKS + 1), usage.MAP_READ);
+    this.found = make(places.fields[1] + places.velocity[1] + 8 * (LOOKS + 1), usage.MAP_READ);
     const padded = new Uint8Array(size);
     padded.set(image);
     device.queue.writeBuffer(this.memory, 0, padded);
@@ -89,13 +89,13 @@ export class Gpu {
 
   /** Finishes a frame of a solver; what failed leaves it at the start. @returns {Promise<number>} substeps */
   async finish(frame, told, /** @type {Solver} */ solver) {
-    const [time, substep, come] = [solver.time, solver.substep, [...solver.wind.come]];
+    const [time, substep] = [solver.time, solver.substep];
     try {
       while (!told.done) told = frame.next(await this.roll(solver, ...told.value));
       return told.value;
     } catch (error) {
       solver.tables.fields.set(solver.before);
-      [solver.time, solver.substep, solver.wind.come] = [time, substep, come];
+      [solver.time, solver.substep] = [time, substep];
       throw error;
     }
   }
