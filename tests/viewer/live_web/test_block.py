@@ -287,7 +287,7 @@ def test_the_worker_is_built_from_its_sources(request):
         "worker.js",
     ]
     names = ["build.js", *(f"live_web/{name}" for name in own), "package-lock.json"]
-    of_the_page = {"dial.js", "page.js", "settings.js"}
+    of_the_page = {"page.js"}
     assert {path.name for path in (player / "live_web").iterdir()} == {*own, *of_the_page, "run.js"}
     checksum = hashlib.sha256(b"".join((player / name).read_bytes() for name in names)).hexdigest()
     assert (PAGE / "worker.min.js").read_text().startswith(f"// Made by tools/player from {checksum}\n")
