@@ -236,7 +236,7 @@ def _read(root: Path, format: str, images: str) -> _Files:
         posed, missing, file = read_transforms(root)
         source = " and ".join(file.name for file, _ in transforms_files(root))
         posed, origin = _counted(posed)
-        points = None if file is None else read_ply_points(file, origin)
+        points = None if file is None else read_ply_points(file, origin)[0]
         return _Files(posed, missing, points, root if root.is_dir() else root.parent, source, origin)
     wanted = {"colmap": "sparse/0 or sparse", "transforms": "transforms.json or transforms_train.json"}
     names = " or ".join(wanted.values()) if format == "auto" else wanted[format]

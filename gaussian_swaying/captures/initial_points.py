@@ -1,4 +1,4 @@
-"""Initial points for Gaussians: from a capture or a file, or random."""
+"""Initial points for Gaussians: from a capture, a file or a mesh, or random."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 from gaussian_swaying._checks import check_positive, check_vector, check_whole
 from gaussian_swaying.captures.agreement import TURNED_AXES, places_in_picture
 from gaussian_swaying.captures.capture import Capture, axes_meet_behind, common_focus, view_reach
-from gaussian_swaying.captures.point_cloud import PointCloud, read_ply_points
+from gaussian_swaying.captures.point_cloud import PointCloud, read_obj_mesh, read_ply_points, sample_mesh
 
 _ATTEMPTS = 100
 
@@ -36,8 +36,8 @@ def initial_points(
     Args:
         capture: The capture.
         source: ``capture`` for the points of the capture, ``random`` for a cube, ``auto`` for the points of the capture
-            if it has any, else random; ``consistent`` for :func:`consistent_points`; or a .ply file with points.
-        count: Number of random or consistent points. All points of a capture or a file are used.
+            if it has any, else random; or a file: .ply with points, .ply or .obj with a mesh.
+        count: Number of points in the cube or on the mesh. All points of a capture or a file are used.
         seed: Seed of the random numbers.
         half_side: Half the side of the cube [scene units]. The default is how far the median camera sees to each side
             of the point that all cameras look at.
@@ -58,10 +58,13 @@ def initial_points(
     if source == "consistent":
         return consistent_points(capture, count, seed, half_side)
     path = Path(source)
+    if path.suffix.lower() == ".obj":
+        return sample_mesh(*read_obj_mesh(path, capture.origin), count=count, seed=seed)
     if path.suffix.lower() == ".ply":
-        return read_ply_points(path, capture.origin)
+        vertices, faces = read_ply_points(path, capture.origin)
+        return vertices if faces is None else sample_mesh(vertices, faces, count, seed)
     raise ValueError(
-        f"Initial points cannot come from {source!s}: set auto, capture, random, consistent, or a .ply file."
+        f"Initial points cannot come from {source!s}: set auto, capture, random, consistent, or a .ply or .obj file."
     )
 
 
@@ -92,7 +95,7 @@ def _away_from_cameras(capture: Capture, center: Tensor, reach: float, count: in
             return PointCloud(points[:count], colors[:count])
     raise ValueError(
         f"The cameras of {capture.path} leave no room for random initial points between them: set the initial points "
-        "to consistent or to a .ply file, or give a larger half side."
+        "to consistent or to a .ply or .obj file, or give a larger half side."
     )
 
 
@@ -168,7 +171,7 @@ def _focus(capture: Capture) -> Tensor:
         behind = f", but away from one ({TURNED_AXES})" if axes_meet_behind(cameras) else ""
         raise ValueError(
             f"The cameras of {capture.path} look at no common point{behind}, so no random initial points can be placed:"
-            " set the initial points to a .ply file."
+            " set the initial points to a .ply or .obj file."
         )
     return focus
 

@@ -105,7 +105,7 @@ def sweep(options: argparse.Namespace, begun: list[Path], arguments: Sequence[st
 
     if options.shards is not None:
         check_whole("shards", options.shards, 1)
-        check_extra("shards", "webdataset", "webdataset")
+        check_extra("shards", "webdataset")
     file = Path(with_shipped(["--config", options.sweep], "sweep")[1])
     parser = Simulation.parser()
     with guessing(parser):

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying._inputs import read_arrays
+from gaussian_swaying.captures.point_cloud import PointCloud, sample_mesh
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,16 +79,7 @@ def surface_points(vertices: Tensor, faces: Tensor, count: int, seed: int = 0) -
     Returns:
         Points [m], float32, shape (count, 3).
     """
-    generator = torch.Generator().manual_seed(seed)
-    corners = vertices.double()[faces]
-    total = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=-1).cumsum(0)
-    if not float(total[-1]) > 0:
-        raise ValueError("Expected a mesh with area, but all its faces are degenerate: export the mesh again.")
-    draw = torch.rand(count, 3, generator=generator, dtype=torch.float64)
-    picked = torch.searchsorted(total, draw[:, 0] * total[-1], right=True).clamp_max(len(faces) - 1)
-    root = draw[:, 1].sqrt()
-    weights = torch.stack([1 - root, root * (1 - draw[:, 2]), root * draw[:, 2]], -1)[..., None]
-    return (weights * corners[picked]).sum(1).float()
+    return sample_mesh(PointCloud(vertices, torch.zeros_like(vertices)), faces, count, seed).points
 
 
 def frame_files(folder: Path) -> list[Path]:

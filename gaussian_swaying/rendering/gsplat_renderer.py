@@ -205,7 +205,9 @@ def rasterize_splat(
     camera: Camera,
     background: Tensor | None = None,
     eps2d: float = 0.3,
+    absgrad: bool = False,
     channels: Tensor | None = None,
+    packed: bool = False,
 ) -> tuple[Tensor, Tensor, ScreenGaussians]:
     """``gsplat.rasterization`` for one camera, built from gsplat's functions.
 
@@ -221,7 +223,9 @@ def rasterize_splat(
         camera: The camera, on the same device.
         background: Colour behind the Gaussians, shape (3,); black when None.
         eps2d: Added to the diagonal of the projected covariances [pixels^2].
+        absgrad: Keep absolute gradients of the centres on the screen.
         channels: Further values to blend behind the colours, over zero, shape (N, E).
+        packed: Keep values of the Gaussians in the picture alone, which takes less memory and one more wait.
 
     Returns:
         Colours and further values (1, H, W, 3 + E), alphas (1, H, W, 1), and where the Gaussians are on the screen.
@@ -229,7 +233,7 @@ def rasterize_splat(
     load_kernels()
     from gsplat import fully_fused_projection, spherical_harmonics
 
-    radii, means2d, depths, conics, _ = fully_fused_projection(
+    found = fully_fused_projection(
         means,
         None,
         quats,
@@ -240,18 +244,29 @@ def rasterize_splat(
         camera.height,
         eps2d=eps2d,
         near_plane=camera.near,
-        packed=False,
+        packed=packed,
         opacities=opacities,  # for a tighter radius
     )
-    seen = (radii > 0).all(-1)
-    colors = spherical_harmonics(sh_degree(sh.shape[-2]), (means - camera.position)[None], sh[None], masks=seen)
+    if packed:
+        _, image, index, radii, means2d, depths, conics, _ = found
+        ids = (image, index)
+        means, sh, opacities = means[index], sh[index], opacities[index]
+        channels = None if channels is None else channels[index]
+    else:
+        radii, means2d, depths, conics, _ = found
+        ids = None
+        means, sh, opacities = means[None], sh[None], opacities[None]
+        channels = None if channels is None else channels[None]
+    colors = spherical_harmonics(
+        sh_degree(sh.shape[-2]), means - camera.position, sh, masks=None if packed else (radii > 0).all(-1)
+    )
     values = (colors + 0.5).clamp_min(0.0)
     behind = None if background is None else background.to(means)[None]
     if channels is not None:
-        values = torch.cat([values, channels[None]], dim=-1)
+        values = torch.cat([values, channels], dim=-1)
         behind = None if behind is None else torch.nn.functional.pad(behind, (0, channels.shape[-1]))
-    pixels, alpha = _rasterize(means2d, radii, depths, conics, values, opacities[None], camera, behind)
-    return pixels, alpha, ScreenGaussians(means2d, radii, None, camera.width, camera.height)
+    pixels, alpha = _rasterize(means2d, radii, depths, conics, values, opacities, camera, behind, absgrad, ids)
+    return pixels, alpha, ScreenGaussians(means2d, radii, ids[1] if ids else None, camera.width, camera.height)
 
 
 def _rasterize(
@@ -263,18 +278,39 @@ def _rasterize(
     opacities: Tensor,
     camera: Camera,
     background: Tensor | None = None,
+    absgrad: bool = False,
+    ids: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Sort the Gaussians into tiles, for which the host waits, and blend values: (1, H, W, C) and (1, H, W, 1)."""
+    """Sort the Gaussians into tiles, for which the host waits, and blend values: (1, H, W, C) and (1, H, W, 1).
+
+    Packed values come with the image (all 0) and the Gaussian that each belongs to.
+    """
     from gsplat import isect_offset_encode, isect_tiles, rasterize_to_pixels
 
     tiles = (-(-camera.width // _TILE), -(-camera.height // _TILE))
-    _, crossings, order = isect_tiles(means2d, radii, depths, _TILE, *tiles, packed=False, n_images=1)
-    offsets = isect_offset_encode(crossings, 1, *tiles).reshape(1, tiles[1], tiles[0])
-    size = (camera.width, camera.height, _TILE)
-    blended: tuple[Tensor, Tensor] = rasterize_to_pixels(
-        means2d, conics, values, opacities, *size, offsets, order, backgrounds=background
+    image, index = (None, None) if ids is None else ids
+    _, crossings, order = isect_tiles(
+        means2d, radii, depths, _TILE, *tiles, packed=ids is not None, n_images=1, image_ids=image, gaussian_ids=index
     )
-    return blended
+    offsets = isect_offset_encode(crossings, 1, *tiles).reshape(1, tiles[1], tiles[0])
+    packed = ids is not None
+    pixels, alpha = rasterize_to_pixels(
+        means2d,
+        conics,
+        values,
+        opacities,
+        camera.width,
+        camera.height,
+        _TILE,
+        offsets,
+        order,
+        backgrounds=None if packed else background,
+        packed=packed,
+        absgrad=absgrad,
+    )
+    if packed and background is not None:  # gsplat 1.5.3 takes none with packed values
+        pixels = pixels + (1 - alpha) * background
+    return pixels, alpha
 
 
 def _compose(pixels: Tensor, alpha: Tensor, background: Tensor | None, dtype: torch.dtype) -> RenderOutput:
@@ -289,18 +325,19 @@ class GsplatRenderer(nn.Module):
 
     Args:
         eps2d: Added to the diagonal of the projected covariances [pixels^2].
+        packed: Keep values of the Gaussians in the picture alone in training, see :func:`rasterize_splat`.
 
     Raises:
         RuntimeError: If there is no CUDA device.
         ValueError: If ``eps2d`` is negative.
     """
 
-    def __init__(self, eps2d: float = 0.3) -> None:
+    def __init__(self, eps2d: float = 0.3, packed: bool = False) -> None:
         super().__init__()
         check_positive("eps2d", eps2d, allow_zero=True)
         if not torch.cuda.is_available():
             raise RuntimeError("GsplatRenderer needs CUDA, but torch finds no CUDA device: use TorchRenderer instead.")
-        self.eps2d = float(eps2d)
+        self.eps2d, self.packed = float(eps2d), bool(packed)
 
     def forward(
         self,
@@ -323,6 +360,7 @@ class GsplatRenderer(nn.Module):
         sh: Tensor,
         camera: Camera,
         background: Tensor | None = None,
+        absgrad: bool = False,
         channels: Tensor | None = None,
     ) -> SplatOutput:
         """Render one picture in training, see :class:`~gaussian_swaying.rendering.protocol.SplatRenderer`.
@@ -333,26 +371,29 @@ class GsplatRenderer(nn.Module):
         if means.device.type != "cuda":
             raise RuntimeError(f"GsplatRenderer needs tensors on a CUDA device, but `means` is on {means.device}.")
         view = camera.to(means.device, torch.float32)
-        given = (means, quats, log_scales.exp(), opacities, sh, view, background, self.eps2d, channels)
-        pixels, alpha, screen = rasterize_splat(*given)
+        scales = log_scales.exp()
+        pixels, alpha, screen = rasterize_splat(
+            means, quats, scales, opacities, sh, view, background, self.eps2d, absgrad, channels, self.packed
+        )
         if channels is None:
             return SplatOutput(pixels[0], alpha[0], screen)
         return SplatOutput(pixels[0, ..., :3], alpha[0], screen, pixels[0, ..., 3:])
 
 
-def make_renderer(device: torch.device | str, detail: float = 0.0) -> SplatRenderer:
+def make_renderer(device: torch.device | str, packed: bool = False, detail: float = 0.0) -> SplatRenderer:
     """Return the renderer for a device: gsplat with CUDA, the torch renderer otherwise.
 
     If gsplat cannot compile its kernels (no ``nvcc``), the torch renderer draws on the GPU, with a warning.
 
     Args:
         device: The device.
+        packed: See :class:`GsplatRenderer`.
         detail: See :class:`~gaussian_swaying.rendering.torch_renderer.TorchRenderer`; gsplat draws all Gaussians.
     """
     if torch.device(device).type != "cuda" or not torch.cuda.is_available():
         return TorchRenderer(detail=detail)
     if gsplat_works():
-        return GsplatRenderer()
+        return GsplatRenderer(packed=packed)
     warnings.warn(
         "gsplat cannot compile its CUDA kernels here (it needs nvcc of torch's CUDA version): drawing with the slower "
         "torch renderer instead.",

@@ -128,6 +128,7 @@ class SplatRenderer(Renderer, Protocol):
         sh: Tensor,
         camera: Camera,
         background: Tensor | None = None,
+        absgrad: bool = False,
         channels: Tensor | None = None,
     ) -> SplatOutput:
         """Render one picture, differentiable with respect to every tensor of the splat.
@@ -140,6 +141,8 @@ class SplatRenderer(Renderer, Protocol):
             sh: Spherical harmonics coefficients, shape (N, K, 3) with K = 1, 4, 9 or 16.
             camera: The camera, on any device and in any precision.
             background: Colour behind the Gaussians, shape (3,); black when None.
+            absgrad: Whether the backward pass stores sums of absolute gradients in ``screen.means2d.absgrad`` (Ye et
+                al. 2024, "AbsGS").
             channels: Further values of each Gaussian to blend in the same pass, shape (N, E).
 
         Returns:

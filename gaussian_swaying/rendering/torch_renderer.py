@@ -353,9 +353,12 @@ class TorchRenderer(nn.Module):
         sh: Tensor,
         camera: Camera,
         background: Tensor | None = None,
+        absgrad: bool = False,
         channels: Tensor | None = None,
     ) -> SplatOutput:
         """Render one picture in training, see :class:`~gaussian_swaying.rendering.protocol.SplatRenderer`."""
+        if absgrad:
+            raise ValueError("TorchRenderer has no absolute gradients: turn `absgrad` off, or train on a GPU.")
         camera = camera.to(means.device, means.dtype)
         # after the projection, so that only visible Gaussians get a colour
         covariances = covariance(quats, log_scales)

@@ -113,9 +113,7 @@ class Outcome:
 
 @cache
 def _parser() -> ArgumentParser:
-    parser = Simulation.parser()
-    gc.freeze()  # loky and `work` look for garbage after each run, which would take as long as a frame or two
-    return parser
+    return Simulation.parser()
 
 
 def work(job: Job, threads: int, explain: Explain, where: str = platform.node()) -> Outcome:
@@ -540,9 +538,9 @@ def run_sweep(
             check_whole(name, count, 1)
     check_whole("retries", retries, 0)
     if ray is not None:
-        check_extra("ray", "ray", "ray")
+        check_extra("ray", "ray")
     if parquet:
-        check_extra("parquet", "pyarrow", "parquet")
+        check_extra("parquet", "pyarrow")
     lock = open_folder(folder, plan, resume, together)
     try:
         started()
@@ -586,7 +584,7 @@ def run_sweep(
         lock.release()
 
 
-def check_extra(option: str, module: str, extra: str) -> None:
+def check_extra(option: str, module: str) -> None:
     """Raise ValueError if an option of the command needs a module that is not installed."""
     if find_spec(module) is None:
-        raise ValueError(f"`--{option}` needs {module}: install gaussian-swaying[{extra}], or leave it out.")
+        raise ValueError(f"`--{option}` needs {module}: install {module}, or leave it out.")

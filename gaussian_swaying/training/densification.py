@@ -38,6 +38,9 @@ class Densification(ABC):
     the optimiser, and :meth:`after_step`. Steps count images from 0.
     """
 
+    absgrad: bool = False
+    """True if the renderer must compute absolute gradients."""
+
     def __init__(self) -> None:
         self._model: GaussianSurfaceModel | None = None
         self._optimizers: dict[str, Any] = {}
@@ -131,12 +134,14 @@ class DefaultDensification(Densification):
         start: Step after which Gaussians may change.
         stop: Step from which they no longer do.
         every: Steps between changes.
-        grow_grad2d: Gradient on the screen (in units of half the picture) above which a Gaussian is copied or split.
+        grow_grad2d: Gradient on the screen (in units of half the picture) above which a Gaussian is copied or split;
+            about 0.0008 with ``absgrad``.
         grow_scale3d: Scale above which it is split rather than copied, as a share of the scene's extent.
         prune_opacity: Opacity below which it is removed.
         prune_scale3d: Scale above which it is removed after ``reset_every``, as a share of the scene's extent.
         reset_every: Steps between resets of the opacities; large Gaussians are pruned after the first.
         reset_opacity: Whether a reset lowers opacities to twice ``prune_opacity``.
+        absgrad: Use absolute gradients (Ye et al. 2024, "AbsGS"); CUDA only.
         split_at: Step at which all large Gaussians are split, at ``stop`` or later (see
             :func:`~gaussian_swaying.gaussians.subdivision.split_large`); null for never. On a surface of one colour
             nothing else makes Gaussians small, and large ones blur the folds of moving cloth.
@@ -159,6 +164,7 @@ class DefaultDensification(Densification):
         prune_scale3d: float = 0.1,
         reset_every: int = 3000,
         reset_opacity: bool = False,
+        absgrad: bool = False,
         split_at: int | None = None,
         split_size: float = 0.008,
     ) -> None:
@@ -180,7 +186,7 @@ class DefaultDensification(Densification):
             raise ValueError(f"Expected `densification.prune_opacity` from 0 to below 0.5, but got {prune_opacity}.")
         if reset_opacity and prune_opacity == 0:
             raise ValueError("Expected `densification.prune_opacity` above 0 with `reset_opacity`, but got 0.")
-        self.reset_opacity = reset_opacity
+        self.absgrad, self.reset_opacity = absgrad, reset_opacity
         self.stop, self.reset_every, self.prune_opacity = stop, reset_every, float(prune_opacity)
         self._options: dict[str, Any] = {
             "refine_start_iter": start,
@@ -191,10 +197,13 @@ class DefaultDensification(Densification):
             "prune_opa": prune_opacity,
             "prune_scale3d": prune_scale3d,
             "reset_every": reset_every,
+            "absgrad": absgrad,
         }
 
     def make_strategy(self, device: torch.device) -> Any:
         """``gsplat.DefaultStrategy`` with these options; on several devices with the gradients of all."""
+        if self.absgrad and device.type != "cuda":
+            raise ValueError("`densification.absgrad` needs CUDA: leave it off on a CPU.")
         return _default_strategy()(**self._in_steps(self._options))
 
     def _initial_state(self, scene_scale: float) -> dict[str, Any]:
@@ -268,7 +277,7 @@ def _default_strategy() -> type:
                 super()._update_state(params, state, info, packed)
                 return
             means2d = info[self.key_for_gradient]
-            grads = means2d.grad.clone()
+            grads = (means2d.absgrad if self.absgrad else means2d.grad).clone()
             grads[..., 0] *= info["width"] / 2.0 * info["n_cameras"]
             grads[..., 1] *= info["height"] / 2.0 * info["n_cameras"]
             seen = (info["radii"] > 0.0).all(dim=-1)  # as a mask: a list of indices would have to reach the host

@@ -85,6 +85,7 @@ class SplatTrainer(lightning.LightningModule):
         seed: Seed of backgrounds and new Gaussians.
         panels: Number of validation images written as panels of photo, render, normals and area.
         log_every: Steps between logged values.
+        packed: Keep values of the Gaussians in the picture alone: less memory on a GPU, one more wait.
         init_ply: Splat with the initial Gaussians.
 
     Attributes:
@@ -109,6 +110,7 @@ class SplatTrainer(lightning.LightningModule):
         seed: int = 0,
         panels: int = 3,
         log_every: int = 50,
+        packed: bool = False,
         init_ply: str | None = None,
     ) -> None:
         super().__init__()
@@ -133,7 +135,7 @@ class SplatTrainer(lightning.LightningModule):
         self._black = max(fixed) == 0.0
         self.scene_scale = scene_scale
         self.seed, self.panels, self.log_every = seed, panels, log_every
-        self.init_ply = init_ply
+        self.packed, self.init_ply = packed, init_ply
         self.model: GaussianSurfaceModel | None = None
         self.renderer = None
         self._made: dict[str, SplatRenderer] = {}  # by kind of device: Lightning moves the model after a fit
@@ -210,6 +212,7 @@ class SplatTrainer(lightning.LightningModule):
         camera: Camera,
         background: Tensor | None = None,
         degree: int | None = None,
+        absgrad: bool = False,
         surface: bool = False,
     ) -> SplatOutput:
         """Draw the Gaussians.
@@ -218,6 +221,7 @@ class SplatTrainer(lightning.LightningModule):
             camera: The camera.
             background: Colour behind them, shape (3,); black when None.
             degree: Degree of the harmonics in use; all when None.
+            absgrad: Whether to compute absolute gradients.
             surface: Whether to blend the channels that :func:`~gaussian_swaying.rendering.planes.surface_maps` needs.
 
         Returns:
@@ -231,7 +235,7 @@ class SplatTrainer(lightning.LightningModule):
             view = camera.to(splat.means.device, splat.means.dtype)
             channels = plane_channels(splat.means, splat.quats, splat.scales, view)
         return self._drawing().render_splat(
-            splat.means, splat.quats, splat.scales, splat.opacity(), sh, camera, background, channels
+            splat.means, splat.quats, splat.scales, splat.opacity(), sh, camera, background, absgrad, channels
         )
 
     def _drawing(self) -> SplatRenderer:
@@ -239,7 +243,7 @@ class SplatTrainer(lightning.LightningModule):
             return self.renderer
         device = self.splat.means.device
         if device.type not in self._made:
-            self._made[device.type] = make_renderer(device)
+            self._made[device.type] = make_renderer(device, self.packed)
         return self._made[device.type]
 
     def training_step(self, batch: Mapping[str, Any]) -> Tensor:
@@ -252,7 +256,9 @@ class SplatTrainer(lightning.LightningModule):
         optimizer.param_groups[0]["lr"] = means_rate(self.rates, self.scene_scale, step, steps, self.devices)
         target, alpha, background = self._target(batch, train=True)
         needs = self.loss.needs(images)
-        output = self.render(batch["camera"], background, self.active_degree(images), bool(needs))
+        output = self.render(
+            batch["camera"], background, self.active_degree(images), self.densification.absgrad, bool(needs)
+        )
         splat = self.splat
         camera, surface = self._surface(output, batch["camera"]) if needs else (None, None)
         inputs = LossInputs(

@@ -1,4 +1,4 @@
-"""Where training starts: points of the capture, of files, and at random."""
+"""Where training starts: points of the capture, of files, of meshes, and at random."""
 
 from dataclasses import replace
 
@@ -12,6 +12,9 @@ from small_captures import arc, write_colmap, write_transforms
 from gaussian_swaying.captures.capture import read_capture
 from gaussian_swaying.captures.generated_capture import GeneratedCapture
 from gaussian_swaying.captures.initial_points import consistent_points, initial_points, random_points
+from gaussian_swaying.captures.point_cloud import PointCloud, read_obj_mesh, sample_mesh
+
+SQUARE = "# a square and its colours\nv 0 0 0 1 0 0\nv 2 0 0 1 0 0\nv 2 1 0 0 0 1\nv 0 1 0 0 0 1\nvn 0 0 1\n"
 
 
 @pytest.fixture
@@ -82,25 +85,53 @@ def test_consistent_points_lie_where_the_photos_agree(tmp_path):
         consistent_points(few, 400)
 
 
-def test_points_of_a_ply(tmp_path, capture):
+def test_a_mesh_is_sampled_by_area(tmp_path, capture):
+    """A 2 x 1 quadrilateral and a 0.5 x 1 upright triangle: 2 to 0.25 of the points."""
+    (tmp_path / "m.obj").write_text(SQUARE + "f 1//1 2//1 3//1 4//1\nv 0 0 5\nv 0.5 0 5\nv 0 0 6\nf -3 -2 -1\n")
+    cloud = initial_points(capture, tmp_path / "m.obj", count=40_000)
+    upright = cloud.points[:, 2] > 4
+    assert float(upright.float().mean()) == pytest.approx(0.25 / 2.25, abs=0.01)
+    flat = cloud.points[~upright]
+    assert peak(flat[:, 2]) == 0
+    counts = torch.histogramdd(flat[:, :2], [4, 2], range=[0.0, 2.0, 0.0, 1.0]).hist
+    alike(counts / len(flat), torch.full((4, 2), 1 / 8), 0.06)
+    near(cloud.colors[~upright][:, 2], flat[:, 1], 1e-5)  # red below, blue above
+    assert cloud.normals[~upright][0].tolist() == [0, 0, 1]
+    assert cloud.normals[upright][0].tolist() == [0, -1, 0]
+
+
+def test_ply_with_and_without_faces(tmp_path, capture):
     rows = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0)], dtype=[(n, "<f4") for n in "xyz"])
     points = PlyElement.describe(rows, "vertex")
     PlyData([points]).write(str(tmp_path / "points.ply"))
     cloud = initial_points(capture, str(tmp_path / "points.ply"), count=7)
     assert cloud.points.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
     assert cloud.colors.unique().tolist() == [0.5]
+    faces = np.empty(1, dtype=[("vertex_indices", "O")])
+    faces["vertex_indices"][0] = np.array([0, 1, 2], dtype=np.int32)
+    PlyData([points, PlyElement.describe(faces, "face")], text=True).write(str(tmp_path / "mesh.ply"))
+    assert len(initial_points(capture, tmp_path / "mesh.ply", count=7)) == 7
 
 
 def test_bad_sources_are_named(tmp_path, capture):
     with value_error("has no points"):
         initial_points(capture, "capture")
-    with value_error(r"points\.xyz.*a \.ply file"):
+    with value_error(r"points\.xyz.*\.ply or \.obj"):
         initial_points(capture, "points.xyz")
-    with value_error(r"none\.ply.*check the path"):
-        initial_points(capture, tmp_path / "none.ply")
+    for name in ("none.ply", "none.obj"):
+        with value_error(rf"{name}.*check the path"):
+            initial_points(capture, tmp_path / name)
     (tmp_path / "text.ply").write_text("hello")
     with value_error(r"text\.ply is not a \.ply"):
         initial_points(capture, tmp_path / "text.ply")
+    (tmp_path / "bad.obj").write_text(SQUARE + "f 1 2 9\n")
+    with value_error(r"bad\.obj has no faces, or faces of vertices that do not exist"):
+        read_obj_mesh(tmp_path / "bad.obj")
+    (tmp_path / "nan.obj").write_text("v nan 0 0\nf 1 1 1\n")
+    with value_error(r"nan\.obj.*NaN"):
+        read_obj_mesh(tmp_path / "nan.obj")
+    with value_error("degenerate"):
+        sample_mesh(PointCloud(torch.zeros(3, 3), torch.zeros(3, 3)), torch.tensor([[0, 1, 2]]), 5)
     with value_error("`count`"):
         initial_points(capture, count=0)
     with value_error("`half_side`"):

@@ -10,7 +10,6 @@ import torch
 from shared import small_network, value_error
 
 from gaussian_swaying.evaluation.compare import compare_run, evaluate, table
-from gaussian_swaying.evaluation.reference import surface_points
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.metrics.frechet_video import FrechetVideoDistance
 
@@ -312,17 +311,3 @@ def test_fvd_without_what_it_needs(make_run, make_reference, network):
 def test_bad_options(compared, option):
     with value_error(f"Expected `{option}` to be positive"):
         compared(**{option: 0})
-
-
-def test_the_points_of_a_surface_are_uniform_by_area():
-    """A 2 x 1 square and a 0.5 x 1 upright triangle: 2 to 0.25 of the points."""
-    vertices = torch.tensor([[0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0], [0, 0, 5], [0.5, 0, 5], [0, 0, 6]])
-    points = surface_points(vertices, torch.tensor([[0, 1, 2], [0, 2, 3], [4, 5, 6]]), 40_000)
-    upright = points[:, 2] > 4
-    assert float(upright.float().mean()) == pytest.approx(0.25 / 2.25, abs=0.01)
-    flat = points[~upright]
-    assert flat[:, 2].abs().max() == 0
-    counts = torch.histogramdd(flat[:, :2], [4, 2], range=[0.0, 2.0, 0.0, 1.0]).hist
-    torch.testing.assert_close(counts / len(flat), torch.full((4, 2), 1 / 8), rtol=0.06, atol=0)
-    with value_error("degenerate"):
-        surface_points(torch.zeros(3, 3), torch.tensor([[0, 1, 2]]), 5)

@@ -227,8 +227,10 @@ def test_kernels_that_were_loaded_before_are_loaded_by_their_file(tmp_path, monk
 
 
 @pytest.mark.gpu
+@pytest.mark.parametrize("absgrad", [False, True])
 @pytest.mark.parametrize("degree", [0, 2])
-def test_put_together_it_is_the_picture_of_gsplat_s_rasterization(degree):
+@pytest.mark.parametrize("packed", [False, True])
+def test_put_together_it_is_the_picture_of_gsplat_s_rasterization(absgrad, degree, packed):
     """Colours, alphas and gradients; the sums of the kernels' atomics are in no fixed order."""
     from gsplat import rasterization
 
@@ -248,7 +250,7 @@ def test_put_together_it_is_the_picture_of_gsplat_s_rasterization(degree):
     for own in (True, False):
         inputs = {name: value.cuda().requires_grad_() for name, value in leaves.items()}
         if own:
-            pixels, alpha, screen = rasterize_splat(*inputs.values(), camera, background)
+            pixels, alpha, screen = rasterize_splat(*inputs.values(), camera, background, 0.3, absgrad, packed=packed)
             centres, radii = screen.means2d, screen.radii
         else:
             pixels, alpha, meta = rasterization(
@@ -259,14 +261,18 @@ def test_put_together_it_is_the_picture_of_gsplat_s_rasterization(degree):
                 70,
                 near_plane=camera.near,
                 sh_degree=degree,
-                packed=False,
-                backgrounds=background[None],
+                packed=packed,
+                backgrounds=None if packed else background[None],  # gsplat 1.5.3 takes none with packed values
+                absgrad=absgrad,
             )
+            pixels = pixels + (1 - alpha) * background if packed else pixels
             centres, radii = meta["means2d"], meta["radii"]
+            assert not packed or torch.equal(screen.index, meta["gaussian_ids"])
         centres.retain_grad()
         ((pixels[0] * weight).sum() + alpha.square().sum()).backward()
+        kept = centres.absgrad if absgrad else centres.grad
         drawn = (radii > 0).all(-1, keepdim=True)  # gsplat leaves the others as the memory was
-        centres, kept = (torch.where(drawn, values, 0.0) for values in (centres, centres.grad))
+        centres, kept = (torch.where(drawn, values, 0.0) for values in (centres, kept))
         found.append([pixels, alpha, drawn.float(), centres, kept, *(leaf.grad for leaf in inputs.values())])
     for one, two in zip(*found, strict=True):
         torch.testing.assert_close(one, two, rtol=1e-3, atol=1e-4 * float(peak(two)))

@@ -244,3 +244,5 @@ def test_a_splat_as_it_is_stored():
     # the centres on the screen are those of a pinhole
     pinhole = project(means, camera)[0][screen.index].float()
     torch.testing.assert_close(screen.means2d.detach(), pinhole, rtol=1e-4, atol=1e-3)
+    with value_error("no absolute gradients"):
+        renderer.render_splat(*tensors, camera, absgrad=True)

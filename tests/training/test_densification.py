@@ -92,6 +92,8 @@ def test_what_needs_cuda_says_so():
     model = _model()
     with value_error(r"MCMCDensification needs CUDA.*use DefaultDensification"):
         MCMCDensification().attach(model, _optimizer(model), 1.0)
+    with value_error(r"`densification.absgrad` needs CUDA"):
+        DefaultDensification(absgrad=True).attach(model, _optimizer(model), 1.0)
 
 
 @pytest.mark.gpu

@@ -239,7 +239,7 @@ def test_gaussians_that_are_not_finite_are_not_kept(data, make_trainer, tmp_path
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("kind", ["default", "mcmc"])
+@pytest.mark.parametrize("kind", ["default", "absgrad", "mcmc"])
 def test_a_training_on_a_gpu(kind, data, make_trainer, tmp_path):
     """gsplat's kernels, fused optimisers and strategies together; the splat draws on a CPU afterwards."""
     if kind == "mcmc":
@@ -247,7 +247,7 @@ def test_a_training_on_a_gpu(kind, data, make_trainer, tmp_path):
         options = {"loss_terms": terms, "loss_weights": {"opacity": 0.01, "scale": 0.01}}
         options["densification"] = MCMCDensification(cap=200, start=20, every=20)
     else:
-        chosen = DefaultDensification(start=20, every=40, grow_grad2d=5e-4)
+        chosen = DefaultDensification(start=20, every=40, grow_grad2d=5e-4, absgrad=kind == "absgrad")
         options = {"densification": chosen}
     module = _module(sh_every=50, **options)
     callbacks = [_checkpoints(tmp_path, every=100)]
