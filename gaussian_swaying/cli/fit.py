@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from gaussian_swaying import _program as program
 from gaussian_swaying.cli.errors import DEVICE, guessing, run_command
-from gaussian_swaying.cli.preview import joined
+from gaussian_swaying.cli.preview import joined, up_of
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.runs.signals import stop_signals
 from gaussian_swaying.simulation.simulation import Simulation
@@ -37,7 +39,7 @@ def build_parser() -> argparse.ArgumentParser:
     add("--config", help="instead of FILM: a YAML file with base, videos, unknowns and, if needed, known; docs/fit.md")
     add("--check", action="store_true", help="only write the files and pictures to look at before the fit")
     add("--output", help="folder for the results; outputs/fits/<name of the film or file> if left out")
-    add("--resume", action="store_true", help="with --config: continue the fit in the folder after its last iteration")
+    add("--resume", action="store_true", help="with --config: continue the fit in the folder after its last step")
     add("--device", **DEVICE)
     return parser
 
@@ -50,56 +52,64 @@ def main(arguments: Sequence[str] | None = None) -> int:
         SIGTERM. With ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
     """
     arguments = joined(sys.argv[1:] if arguments is None else arguments)
-    parser = build_parser()
-    begun: list[str] = []
+    parser, begun = build_parser(), list[str]()
 
     def advice(error: BaseException) -> str | None:
-        return f"To continue it:\n  {begun[0]}" if isinstance(error, KeyboardInterrupt) and begun else None
+        if not isinstance(error, KeyboardInterrupt):
+            return None
+        return f"All steps that were done are kept. To continue:\n  {begun[0]}" if begun else "Nothing was fitted yet."
 
     return run_command(
-        lambda: fit(parser.parse_args(arguments), begun),
-        stopped="Stopped; the last complete iteration is kept.",
-        memory=MEMORY,
-        arguments=arguments,
-        advice=advice,
+        lambda: fit(parser.parse_args(arguments), begun), memory=MEMORY, arguments=arguments, advice=advice
     )
 
 
 def fit(options: argparse.Namespace, begun: list[str]) -> int:
     """Fit and print the table; the command that continues the fit is put into ``begun`` once it can."""
     from gaussian_swaying.inverse.fit import OURS, check_fit, run_fit
-    from gaussian_swaying.inverse.unknowns import read_plan
+    from gaussian_swaying.inverse.from_film import RESULT, prepare
+    from gaussian_swaying.inverse.plan import read_plan
 
     _check(options)
-    if options.film is None:
-        file = Path(with_shipped(["--config", options.config], "fit")[1])
-        folder = Path(options.output or Path("outputs") / "fits" / file.stem)
-    else:
-        from gaussian_swaying.cli.fit_film import RESULT, prepare
-
-        whole = Path(options.output or Path("outputs") / "fits" / Path(options.film).stem)
-        file, folder = prepare(options, whole), whole / RESULT
-        print(f"wrote {file}", flush=True)
-    again = program.command("fit", "--config", options.config or file, "--output", folder)
-    plan = read_plan(file, lambda name: with_shipped(["--config", name], "sim")[1])
-    with guessing(Simulation.parser()), stop_signals():
-        if options.check:
-            for path in check_fit(plan, folder, device=options.device):
-                print(f"wrote {path}")
-            print(f"to fit:\n  {again}")
-            return 0
-        result = run_fit(
-            plan,
-            folder,
-            resume=options.resume,
-            device=options.device,
-            started=lambda: begun.append(f"{again} --resume"),
-            in_use=[Path(file)],
-        )
-    print(result.text())
-    for name in OURS[1:]:
-        print(f"wrote {folder / name}")
+    with stop_signals():
+        if options.film is None:
+            file = Path(with_shipped(["--config", options.config], "fit")[1])
+            folder = Path(options.output or Path("outputs") / "fits" / file.stem)
+        else:
+            whole = Path(options.output or Path("outputs") / "fits" / Path(options.film).stem)
+            up = None if options.up is None else up_of(options.up)
+            given: dict[str, Any] = {name: getattr(options, name) for name in ("hold", "focal", "device")}
+            file = prepare(options.film, options.splat, whole, length=_length(options.length), up=up, **given)
+            folder = whole / RESULT
+            print(f"wrote {file}", flush=True)
+        again = program.command("fit", "--config", options.config or file, "--output", folder)
+        plan = read_plan(file, lambda name: with_shipped(["--config", name], "sim")[1])
+        with guessing(Simulation.parser()):
+            if options.check:
+                for path in check_fit(plan, folder, device=options.device):
+                    print(f"wrote {path}")
+                print(f"to fit:\n  {again}")
+                return 0
+            going: dict[str, Any] = {"resume": options.resume, "device": options.device, "in_use": [file]}
+            result = run_fit(plan, folder, started=lambda: begun.append(f"{again} --resume"), **going)
+    print("\n".join([result.text(), *(f"wrote {folder / name}" for name in OURS[1:])]))
     return 0
+
+
+def _length(given: Sequence[str] | None) -> Any:
+    """Name and metres of ``--length``."""
+    if given is None or list(given) == ["gravity"]:
+        return given and "gravity"
+    metres = " ".join(given[1:]) or "nothing"
+    try:
+        value = float(metres)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise ValueError(
+            f"Expected `--length` to be gravity, or a name and a length in metres, such as pole 2.4, but got {metres}."
+        )
+    return given[0], value
 
 
 def _check(options: argparse.Namespace) -> None:

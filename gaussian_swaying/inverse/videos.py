@@ -53,7 +53,6 @@ class Footage:
         cameras: The camera of each frame; the same one for a tripod.
         images: Frames, dtype uint8, shape (F, H, W, 3).
         masks: Opacity of the object in each frame, dtype uint8, shape (F, H, W); None if it is not known.
-        itself: Whether it is known to show the thing itself, and not what the splat shows.
     """
 
     name: str
@@ -61,7 +60,6 @@ class Footage:
     cameras: tuple[Camera, ...]
     images: Tensor
     masks: Tensor | None = None
-    itself: bool = False
 
     @property
     def size(self) -> tuple[int, int]:

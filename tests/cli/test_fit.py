@@ -8,7 +8,7 @@ from shared import refused
 
 from gaussian_swaying.cli import shipped
 from gaussian_swaying.cli.fit import main
-from gaussian_swaying.inverse.unknowns import read_plan
+from gaussian_swaying.inverse.plan import read_plan
 
 
 def _file(path, **fields):

@@ -10,11 +10,23 @@ from shared import double, value_error
 from small_films import TRUTH, changed
 
 from gaussian_swaying.inverse.evidence import HELD
-from gaussian_swaying.inverse.fit import GRIDS, ROUNDS, Course, run_fit
-from gaussian_swaying.inverse.unknowns import SHAKEN
+from gaussian_swaying.inverse.fit import GRIDS, ROUNDS, Course, Say, run_fit
+from gaussian_swaying.inverse.rivals import SHAKEN
 from gaussian_swaying.inverse.videos import read_videos
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")
+
+
+class Said(Say):
+    """Keeps the lines in a list."""
+
+    def __init__(self, lines):
+        super().__init__(False)
+        self.lines = lines
+
+    def __call__(self, line):
+        self.lines.append(line)
+
 
 SPEED, AZIMUTH = {"wind.speed": [2.0, 12.0]}, {"wind.azimuth": [-20.0, 100.0]}
 
@@ -41,7 +53,7 @@ def test_another_end_that_fits_as_well_is_a_rival(fit_of):
 
     def others(*ended):
         made._brief = lambda places, evidence, times: ([end for end, _ in ended], [cost for _, cost in ended])
-        return made._others(here, [far])
+        return made.others(here, [far])
 
     assert others((here, 1.0), (far, 1.04)) == ([made.values(far)], [])
     assert others((here, 1.0), (far, 1.09)) == ([], [])
@@ -50,7 +62,7 @@ def test_another_end_that_fits_as_well_is_a_rival(fit_of):
     assert others((here, 1.0), (far, 1.3)) == ([], [])
     assert others((far, 1.0), (near, 1.3)) == ([made.values(far)], far)
     assert others((near, 1.0)) == ([], [])
-    assert made._others(here, []) == ([], [])  # nothing else is tried
+    assert made.others(here, []) == ([], [])  # nothing else is tried
 
 
 def test_a_softer_and_a_stiffer_material_are_tried_at_the_end(fit_of):
@@ -63,7 +75,7 @@ def test_a_softer_and_a_stiffer_material_are_tried_at_the_end(fit_of):
         return [places[1], places[0]], [1.0, 2.0]
 
     made._brief = brief
-    found, better = made._others([0.5, 0.5], [])
+    found, better = made.others([0.5, 0.5], [])
     assert [place[1] for place in tried] == [0.5, 0.5 - SHAKEN, 0.5 + SHAKEN]
     assert {place[0] for place in tried} == {0.5}
     assert better == [0.5, 0.5 - SHAKEN]
@@ -80,7 +92,7 @@ def test_a_fit_goes_on_from_a_better_end_but_not_for_ever(fit_of, better, rounds
         asked.append((place, rivals))
         return [{"wind.speed": 9.0}], [0.9] * (len(asked) <= better)
 
-    made._others, made.say = others, said.append
+    made.others, made.say = others, Said(said)
     result = made.run(course, lambda course: None)
     assert course.rounds == len(asked) - 1 == rounds
     assert course.rivals == asked[-1][1] == [place for place, _ in asked[:-1]]
@@ -114,12 +126,11 @@ def test_the_error_of_the_grid_is_in_the_standard_errors(own, simulation, fit_of
     made = fit_of(SPEED)
     evidence = made.evidence("tracks")
     place = double([made.plan.unknowns[0].share(5.0)])
-    for _ in range(3):
-        place = double(made.solved(place.tolist(), evidence, made.fitted))
+    place = made.solved(place.tolist(), evidence, made.fitted, 24, True).place
 
     def model(other):
         made.on_grid, made._other_grids = lambda ratio: other, None
-        return float(made._at_the_end(place, evidence)[1])
+        return float(made.grid_covariance(place, evidence))
 
     assert model(simulation) ** 0.5 < 5e-3
     denser = changed(own, material={"density": 27.0})
@@ -204,8 +215,8 @@ def test_another_grid_that_the_scene_refuses_is_left_out_and_said(simulation, fi
             raise ValueError("`solver.dx` is too small.")
         return simulation
 
-    made = fit_of(SPEED, further={"say": said.append, "on_grid": on_grid})
-    assert made._grids() == made._grids() == [simulation]
+    made = fit_of(SPEED, further={"say": Said(said), "on_grid": on_grid})
+    assert made.grids() == made.grids() == [simulation]
     assert asked == list(GRIDS)
     (line,) = said
     assert (
