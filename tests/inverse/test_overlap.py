@@ -2,13 +2,16 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 from shared import longest, near
 from small_films import cameras
 
+from gaussian_swaying import Simulation
 from gaussian_swaying.inverse import tracks as overlap
 from gaussian_swaying.inverse.tracks import drawn_beside
 from gaussian_swaying.rendering.cameras.camera import project
+from gaussian_swaying.scenes.procedural import FlagScene
 
 
 def test_where_a_gaussian_is_drawn_is_the_mean_of_its_pixels(simulation):
