@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from copy import copy
 from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,7 @@ from gaussian_swaying.inverse.least_squares import (
     solve,
     step_from,
 )
+from gaussian_swaying.inverse.look import AWAY, first_look
 from gaussian_swaying.inverse.pictures import BEFORE, write_before
 from gaussian_swaying.inverse.plan import Plan, parse_base, read_unknown
 from gaussian_swaying.inverse.report import (
@@ -104,9 +106,8 @@ the ranges."""
 COARSE = {"tracks": 0.02, "matches": 0.02, "silhouettes": 0.1, "pixels": 0.1}
 """Standard deviations of residuals in the coarse search: shares of the picture's width, and grey levels."""
 
-LONG_STILL, AWAY = 0.05, 3.0
-"""Longest time that a film may be still [s], and largest distance between its first frame and the splat at rest
-[pixels], if the start of its motion is no unknown."""
+LONG_STILL = 0.05
+"""Longest time that a film may be still, if the start of its motion is no unknown [s]."""
 
 SPREAD = ("wind.speed", "wind.azimuth")
 """Unknowns whose starts are spread over their ranges although one was given."""
@@ -201,6 +202,7 @@ class Problem:
         on_grid: Makes the simulation with cells so many times as large, to know what the grid does to the values; None
             to leave that.
         judged: What the background said of the videos, see :func:`~gaussian_swaying.inverse.hand.prepared`.
+        looked: Sentences on cameras that are not where they are said to be.
 
     Raises:
         ValueError: If the plan does not fit the simulation or the videos.
@@ -214,10 +216,12 @@ class Problem:
         say: Say | None = None,
         judged: Sequence[Judged] = (),
         on_grid: Callable[[float], Simulation] | None = None,
+        looked: Sequence[str] = (),
     ) -> None:
         check_unknowns(simulation, plan.unknowns)
         self.simulation, self.videos, self.plan = simulation, list(videos), plan
-        self.say, self.judged, self.on_grid = say or Say(False), tuple(judged), on_grid
+        self.say, self.judged = say or Say(False), tuple(judged)
+        self.on_grid, self.looked = on_grid, list(looked)
         self.times = frame_times(videos)
         fitted = max(3, round(plan.fit_share * len(self.times)))
         if plan.until is not None:
@@ -662,7 +666,7 @@ class Problem:
                 "The camera was found from a frame in which the object may move already, so all values may be off: "
                 "give a film that begins at rest."
             )
-        return found + self._notes_on_start()
+        return found + (self.looked or self._notes_on_start())
 
     def _notes_on_start(self) -> list[str]:
         if self.begins is not None or not self.followed:
@@ -751,14 +755,13 @@ def run_fit(
     lock = hold_folder(folder, remedy) if resume else claim_folder(folder, OURS, remedy, needed)
     try:
         course = _read_course(folder, described) if resume else Course()
-        if not resume:
-            course.seconds = time.monotonic() - begin
 
         def keep(course: Course) -> None:
             write_json(folder / PROGRESS, {"plan": described, "course": vars(course)})
             started()
 
         problem.look(folder)
+        course.seconds += time.monotonic() - begin
         try:
             result = problem.run(course, keep, folder / PICTURES)
         except ValueError:
@@ -796,14 +799,31 @@ def _ready(plan: Plan, parser: Any, settings: Any, device: str, progress: bool) 
     own.camera = own.cameras = None  # the videos have their own
     simulation, say = Simulation.from_settings(parser, own), Say(progress)
     videos = read_videos(list(plan.videos), plan.cameras, simulation.scene.size, simulation.scene.model.origin)
-    videos, judged = prepared(simulation, videos, plan.hand_held, plan.also_moves, say)
+    looked = _looked(simulation, videos, plan) if find_spec("cv2") else []
+    with say.work("the camera and the light of each frame", sum(len(video.times) for video in videos)):
+        videos, judged = prepared(simulation, videos, plan.hand_held, plan.also_moves, say, say.tick)
 
     def on_grid(ratio: float) -> Simulation:
         given = own.clone()
         given.solver.dx = ratio * given.solver.dx
         return Simulation.from_settings(parser, given)
 
-    return Problem(simulation, videos, plan, say, judged, on_grid)
+    return Problem(simulation, videos, plan, say, judged, on_grid, looked)
+
+
+def _looked(simulation: Simulation, videos: Sequence[Footage], plan: Plan) -> list[str]:
+    """Sentences on cameras that are not where they are said to be; ValueError if a film does not show the splat."""
+    found, moving = [], any(u.name == FILM_START and u.low < 0 for u in plan.unknowns)
+    for video in videos:
+        shown, told = first_look(simulation, video)
+        if not shown and not moving:
+            raise ValueError(
+                f"The first frame of camera {video.name} does not show the splat where its camera looks: give a film "
+                "of this splat, or find its camera with `gaussian-swaying camera FILM SPLAT` (its places may be in "
+                f"another unit); if it begins in motion, add {FILM_START}: {{range: [-1, 0]}} to `unknowns`."
+            )
+        found += [told] if told else []
+    return found
 
 
 def fit(

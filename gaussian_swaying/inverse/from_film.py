@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -28,7 +29,8 @@ from gaussian_swaying.inverse.film import (
     open_film,
     view_of_focal,
 )
-from gaussian_swaying.inverse.fit import check_fit, run_fit
+from gaussian_swaying.inverse.fit import run_fit
+from gaussian_swaying.inverse.look import FOUND, shown_in
 from gaussian_swaying.inverse.pictures import side_by_side, titled
 from gaussian_swaying.inverse.plan import read_plan
 from gaussian_swaying.inverse.registration import (
@@ -118,12 +120,6 @@ def fit_film(
     return run_fit(read_plan(file), file.parent / RESULT, device=device, progress=progress, in_use=[file])
 
 
-def check_film(film: str, splat: str, output: str | os.PathLike[str], **settings: Any) -> list[Path]:
-    """Write all that :func:`fit_film` writes before the fit, and return the pictures."""
-    file = prepare(film, splat, output, **settings)
-    return [file, *check_fit(read_plan(file), file.parent / RESULT, device=settings.get("device", "auto"))]
-
-
 def prepare(
     film: str | os.PathLike[str],
     splat: str | os.PathLike[str],
@@ -206,19 +202,21 @@ def registered(
     draw, known = painter_of(cloud), focal or head.focal
     fov = VIEW if known is None else view_of_focal(known, head.width, head.height)
     start = first_cameras(cloud, up, fov, head.width, head.height)
-    try:
+    found, picture = None, draw(start[0])
+    with suppress(ValueError):
         found = find_camera(draw, frame, start, focal=known is None)
-    except ValueError as error:
+        picture = draw(found.camera)
+    if found is None or shown_in(picture, frame)[0] < FOUND:
         raise ValueError(
             f"The splat was not found in the first frame of {film}. It has to show the object at rest, large "
             "and with texture, from a side that was captured; `--up` and `--focal` help."
-        ) from error
+        )
     source = "found" if known is None else f"of {known:g} mm" + ("" if focal else ", as the film says")
     told = (
         f"camera: {found.agreeing} of {found.matches} points agree, {found.residual:.1f} pixels off; focal length "
         f"{source} ({fov_of(found.camera):.0f} degrees from top to bottom)"
     )
-    return Seen(head, frame, cloud, found.camera, draw(found.camera), found.residual), told
+    return Seen(head, frame, cloud, found.camera, picture, found.residual), told
 
 
 def direction(up: str | Sequence[float]) -> list[float]:

@@ -139,12 +139,15 @@ def stands_still(video: Footage) -> bool:
     return bool((views == views[:1]).all())
 
 
-def follow_camera(video: Footage, background: Background) -> Motion:
+def follow_camera(
+    video: Footage, background: Background, tick: Callable[[int], object] = lambda frames: None
+) -> Motion:
     """Find the camera of each frame.
 
     Args:
         video: The film. Its cameras may be those of the first frame, or rough ones of all frames.
         background: What stands still.
+        tick: Called with 1 after each frame.
     """
     found: list[Registration | None] = []
     last: Camera | None = None
@@ -160,6 +163,7 @@ def follow_camera(video: Footage, background: Background) -> Motion:
             camera = seen.camera
         last = camera
         found.append(seen)
+        tick(1)
     unseen = tuple(k for k, camera in enumerate(found) if camera is None)
     if 2 * len(unseen) > len(found):
         raise ValueError(
@@ -360,6 +364,7 @@ def prepared(
     hand_held: bool | None = None,
     also_moves: Sequence[str] = (),
     say: Callable[[str], None] = lambda line: None,
+    tick: Callable[[int], object] = lambda frames: None,
 ) -> tuple[list[Footage], list[Judged]]:
     """Find the camera of each frame of films from a hand, and take drifts of exposure and white balance off all films.
 
@@ -370,6 +375,7 @@ def prepared(
             camera, but whose background moves by more than half a pixel.
         also_moves: Names of parts of the splat that move in the films, though the simulation does not move them.
         say: Called with a line for each thing that is done.
+        tick: Called with the number of frames whose camera was found.
 
     Returns:
         The films, and what the background says of each; nothing if the splat has none.
@@ -391,7 +397,7 @@ def prepared(
         if hand_held is not False and stands_still(video):
             one = replace(one, moved=moves_by(video, background))
         if hand_held or (one.moved > STILL and hand_held is None):
-            motion = follow_camera(video, background)
+            motion = follow_camera(video, background, tick)
             video = replace(video, cameras=motion.cameras)
             one = replace(one, hand_held=True, residual=motion.residual, unseen=len(motion.unseen))
         if (bright := gains(video, background)) is not None:

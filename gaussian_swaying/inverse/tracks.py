@@ -165,7 +165,7 @@ def track(simulation: Simulation, video: Footage, most: int = 400, first: Deform
     chosen, start = _chosen(simulation, video, _grey(drawn), most, first)
     images = torch.cat([drawn[None], video.images])
     position, seen = map(torch.from_numpy, follow(images.numpy(), start.numpy()))
-    seen &= _alike(images[:2], position[:2]) > ALIKE
+    seen &= alike(images[:2], position[:2]) > ALIKE
     return Tracks(chosen, position[1:], seen[1:])
 
 
@@ -190,7 +190,7 @@ def beside_rest(simulation: Simulation, video: Footage, most: int = 400) -> floa
     return float((off - off.median(0).values).norm(dim=-1).quantile(0.75)) if len(off) else 0.0
 
 
-def _alike(images: Tensor, position: Tensor) -> Tensor:
+def alike(images: Tensor, position: Tensor) -> Tensor:
     """Correlation of the surroundings of points in two pictures (2, H, W, 3) at positions (2, T, 2), shape (T,)."""
     side = window_of(images.shape[2], images.shape[1])
     planes = images.double().mean(-1)[:, None]
@@ -210,10 +210,6 @@ def still_until(simulation: Simulation, video: Footage, tracks: Tracks) -> float
     A point has moved if it is more than :data:`STILL` from where the camera of the frame would see it if it had stayed.
     A quarter of the points has to.
 
-    Args:
-        simulation: The scene.
-        video: The video.
-        tracks: Its tracks.
     """
     scene = simulation.scene
     means = scene.model.means.detach()[scene.moving[tracks.index.to(scene.moving.device)]]
@@ -238,8 +234,7 @@ def match(
     is the case. The offset that remains there comes from a camera that is not quite right: its median is subtracted in
     all frames, unless the video begins in motion.
 
-    Near the border of the object a window shows more border than texture, and the border of a splat is not quite that
-    of the real object. Such Gaussians are left out.
+    Gaussians near the border are left out, as the border of a splat is not quite that of the real object.
 
     Args:
         simulation: The scene.

@@ -3,14 +3,18 @@
 import json
 import math
 import shutil
+import time
 from dataclasses import replace
 
 import pytest
+import yaml
 from shared import double, value_error
 from small_films import TRUTH, changed
 
+import gaussian_swaying.inverse.fit as module
+from gaussian_swaying.cli.fit import main
 from gaussian_swaying.inverse.evidence import HELD
-from gaussian_swaying.inverse.fit import GRIDS, ROUNDS, Course, Say, run_fit
+from gaussian_swaying.inverse.fit import GRIDS, ROUNDS, Course, Problem, Say, run_fit
 from gaussian_swaying.inverse.rivals import SHAKEN
 from gaussian_swaying.inverse.videos import read_videos
 
@@ -180,6 +184,63 @@ def test_stopped_and_continued(fit_of, tmp_path):
     assert stops == 3
     assert result.place == whole.place
     assert [row["cost"] for row in result.history] == [row["cost"] for row in whole.history]
+
+
+@pytest.mark.parametrize("where", ["search", "best_of", "others"])
+def test_a_fit_that_is_stopped_says_how_it_goes_on_and_does(own, tmp_path, capsys, monkeypatch, where):
+    """Also in the search, before the first step, and at the end."""
+    plan = {"base": str(own / "base.yaml"), "videos": str(own / "video"), "unknowns": {"wind.speed": [2.0, 12.0]}}
+    small = {"search": 3, "starts": 1, "iterations": 1, "tracks": 40, "stages": ["tracks"], "until": 0.2}
+    (tmp_path / "fit.yaml").write_text(yaml.safe_dump(plan | small))
+    words = ["--config", str(tmp_path / "fit.yaml"), "--output", str(tmp_path / "fit"), "--device", "cpu"]
+
+    def stopped(*given):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Problem, where, stopped)
+        assert main(words) == 130
+    told = capsys.readouterr().err
+    assert "All steps that were done are kept. To continue:" in told
+    assert told.rstrip().endswith("--resume")
+    assert main([*words, "--resume"]) == 0
+    again = capsys.readouterr()
+    assert "wind.speed" in again.out
+    assert ("] search: wind.speed" in again.err) == (where != "others")
+
+
+def test_what_a_fit_takes_is_said_before_it_starts_and_then_what_is_left(fitted, capsys):
+    fitted(SPEED, search=4, iterations=1, stages=["tracks"], tracks=40, progress=True)
+    told = capsys.readouterr().err
+    for words in ("simulations of 0.208 s: some ", "search:", "frame/s]"):
+        assert words in told
+    assert told.index("simulations of 0.208 s") < told.index("search:")
+    assert "coarser grid" not in told
+
+
+def test_the_time_of_a_fit_is_that_of_all_of_it(fitted, monkeypatch):
+    """By a clock on which films take 1000 s to prepare, and 1000 s to compare with the result."""
+    late, now = [0.0], time.monotonic
+    monkeypatch.setattr("gaussian_swaying.inverse.fit.time.monotonic", lambda: now() + late[0])
+
+    def slow(name):
+        known = getattr(module, name)
+
+        def later(*given):
+            late[0] += 1000.0
+            return known(*given)
+
+        monkeypatch.setattr(module, name, later)
+
+    slow("prepared")
+    slow("predictions")
+    result = fitted(SPEED, search=0, iterations=1, stages=["tracks"], tracks=40)
+    assert result.seconds > 2000.0
+
+
+def test_a_coarser_grid_is_proposed_where_a_fit_takes_long(fit_of, monkeypatch):
+    monkeypatch.setattr("gaussian_swaying.inverse.fit.LONG", 0.0)
+    assert fit_of(SPEED).expected().endswith("less than half of it on a coarser grid (`known: {solver.dx: 0.13}`)")
 
 
 def test_resume_needs_the_same_plan(plan_of, tmp_path):
