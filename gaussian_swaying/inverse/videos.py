@@ -125,7 +125,7 @@ def read_videos(
 ) -> list[Footage]:
     """Read the videos of one motion.
 
-    docs/fit.md describes the ``transforms.json`` of each folder. Cameras that are not wanted are not decoded; the others
+    docs/fit.md describes ``transforms.json`` of a folder. Cameras that are not wanted are not decoded; the others
     together may have :data:`MOST_FRAMES` and :data:`MOST_BYTES`.
 
     Args:
