@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gaussian_swaying import _program as program
-from gaussian_swaying._checks import first_line
+from gaussian_swaying._checks import check_whole, first_line
 from gaussian_swaying.cli.errors import DEVICE, command, guessing, run_command, sentence
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.runs.signals import stop_signals
@@ -46,13 +46,7 @@ def build_parser() -> argparse.ArgumentParser:
         help="simulate up to N runs of equal shape as one, which a GPU does many times faster if they are small; they "
         "then take substeps of the same length",
     )
-    add(
-        "--per-gpu",
-        type=_number_or_auto,
-        default=1,
-        metavar="N",
-        help="jobs at a time on each GPU; auto for as many as its memory holds, by what the first ones took",
-    )
+    add("--per-gpu", type=int, default=1, metavar="N", help="jobs at a time on each GPU")
     add(
         "--ray",
         nargs="?",
@@ -60,27 +54,16 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="ADDRESS",
         help="let Ray do the runs, on this machine or on the cluster at an address; needs gaussian-swaying[ray]",
     )
-    add(
-        "--part",
-        type=_part,
-        metavar="I/N",
-        help="do only the I-th of N parts; other processes do the others in the same folder, as in a SLURM array. "
-        "It continues what is there",
-    )
     add("--parquet", action="store_true", help="also write sweep.parquet; needs gaussian-swaying[parquet]")
-    add("--shards", type=int, metavar="N", help="also write the runs as WebDataset shards, N runs in each")
+    add(
+        "--shards",
+        type=int,
+        metavar="N",
+        help="also write the runs as WebDataset shards, N runs in each; needs gaussian-swaying[webdataset]",
+    )
     add("--picture", default="last", choices=("last", "middle"), help="frame of the contact sheet")
     add("--list", action="store_true", help="print the runs and end")
     return parser
-
-
-def _number_or_auto(text: str) -> int | None:
-    return None if text == "auto" else int(text)
-
-
-def _part(text: str) -> tuple[int, int]:
-    number, _, parts = text.partition("/")
-    return int(number), int(parts)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -119,11 +102,11 @@ def sweep(options: argparse.Namespace, begun: list[Path], arguments: Sequence[st
     from gaussian_swaying.sweeps.dataset import SHARDS, write_shards
     from gaussian_swaying.sweeps.plan import make_plan, read_sweep
     from gaussian_swaying.sweeps.record import PARQUET, TABLE
-    from gaussian_swaying.sweeps.run import run_sweep
+    from gaussian_swaying.sweeps.run import check_extra, run_sweep
 
-    if options.shards is not None and (options.shards < 1 or options.part is not None):
-        raise ValueError("Expected `--shards` to be at least 1, and without `--part`: write them when all is done.")
-
+    if options.shards is not None:
+        check_whole("shards", options.shards, 1)
+        check_extra("shards", "webdataset")
     file = Path(with_shipped(["--config", options.sweep], "sweep")[1])
     parser = Simulation.parser()
     with guessing(parser):
@@ -147,15 +130,14 @@ def sweep(options: argparse.Namespace, begun: list[Path], arguments: Sequence[st
         )
     counts = Counter(result["status"] for result in results.values())
     print(f"{len(results)} runs: {', '.join(f'{count} {status}' for status, count in sorted(counts.items()))}")
-    tables = [folder / name for name in (TABLE, PARQUET) if (folder / name).exists()]  # the last part writes them
+    wrote = [folder / "runs", folder / TABLE, *sorted(folder.glob("contact_sheet*.png"))]
     complete = [name for name, result in results.items() if result["status"] == "complete"]
-    shards = []
     if options.shards is not None and complete:
         place = folder / "runs" / complete[0]  # with all that was recorded
         frames, positions = (place / "frames").is_dir(), (place / "trajectory.npz").exists()
         write_shards(folder, options.shards, frames=frames, positions=positions)
-        shards = [folder / SHARDS]
-    for file in (folder / "runs", *tables, *sorted(folder.glob("contact_sheet*.png")), *shards):
+        wrote.append(folder / SHARDS)
+    for file in (*wrote, *([folder / PARQUET] if options.parquet else [])):
         print(f"wrote {file}")
     failed = [name for name, result in sorted(results.items()) if result["status"] != "complete"]
     if failed:

@@ -87,15 +87,6 @@ class ScreenGaussians:
     width: int
     height: int
 
-    def seen(self, count: int) -> Tensor:
-        """Return a mask of the drawn ones among ``count`` Gaussians, bool, shape (N,)."""
-        drawn = (self.radii > 0).all(-1)
-        if self.index is None:
-            return drawn[0]
-        seen = torch.zeros(count, dtype=torch.bool, device=drawn.device)
-        seen[self.index] = drawn
-        return seen
-
     def info(self) -> dict[str, Any]:
         """The same with the names that the strategies of gsplat 1.5 expect."""
         return {

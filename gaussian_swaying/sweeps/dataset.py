@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import os
-import tarfile
 from collections.abc import Mapping
 from numbers import Real
 from pathlib import Path
@@ -18,10 +16,13 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from gaussian_swaying._checks import check_positive
-from gaussian_swaying._files import atomic
+from gaussian_swaying._files import atomic, without_nan
 from gaussian_swaying.recording.nodes import load_nodes
 from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.sweeps.record import RUNS, SUMMARY, read_record, read_result
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 
 class SweepDataset(Dataset[dict[str, Any]]):
@@ -82,7 +83,7 @@ class SweepDataset(Dataset[dict[str, Any]]):
         place = self.folder / RUNS / self.runs[index]
         item = {"run": self.runs[index], "parameters": self._parameters[index], "summary": self._summary[index]}
         if self.frames:
-            item["frames"] = _read_frames(place)
+            item["frames"] = _read_frames(self.folder, self.runs[index])
         if self.positions:
             path, count = place / "trajectory.npz", int(self._summary[index, self.summary_names.index("frames")])
             _check_recorded(path, "positions", "recorder.trajectory: true")
@@ -101,12 +102,12 @@ def _numbers(value: Any) -> list[float]:
     return [number for part in parts for number in part] if all(parts) else []
 
 
-def _read_frames(place: Path) -> Tensor:
+def _read_frames(folder: Path, run: str) -> Tensor:
     from PIL import Image
 
-    files = sorted((place / "frames").glob("[0-9]*.png"))
+    files = _pictures(folder, run)
     if not files:
-        _check_recorded(place / "frames" / "00000.png", "frames", "recorder.renders with color")
+        _check_recorded(folder / RUNS / run / "frames/00000.png", "frames", "recorder.renders with color")
     pictures = []
     for file in files:
         try:
@@ -135,7 +136,7 @@ def write_shards(
     positions: bool = False,
     nodes: bool = False,
 ) -> list[Path]:
-    """Write the complete runs of a sweep as tar files ``000000.tar`` and so on, which WebDataset reads.
+    """Write the complete runs of a sweep as tar files ``000000.tar`` and so on for WebDataset, which must be installed.
 
     A sample has ``json`` (run, settings, summary), ``parameters.npy``, and what is wanted of ``00000.png`` and so on
     (its pictures), ``positions.npy`` and ``nodes.npy``, as in :class:`~gaussian_swaying.sweeps.dataset.SweepDataset`.
@@ -152,6 +153,8 @@ def write_shards(
     Returns:
         The files.
     """
+    import webdataset
+
     check_positive("runs_per_shard", runs_per_shard)
     data = SweepDataset(folder, frames=False, positions=positions, nodes=nodes)
     target = Path(folder) / SHARDS if output is None else Path(output)
@@ -159,45 +162,30 @@ def write_shards(
     made = []
     for first in range(0, len(data), runs_per_shard):
         made.append(target / f"{first // runs_per_shard:06d}.tar")
-        with atomic(made[-1]) as temporary, tarfile.open(temporary, "w", format=tarfile.USTAR_FORMAT) as tar:
+        with atomic(made[-1]) as temporary, temporary.open("wb") as file, webdataset.TarWriter(file, mtime=0) as tar:
             for index in range(first, min(first + runs_per_shard, len(data))):
-                _add_run(tar, data, index, frames)
-    for file in target.glob("[0-9]" * 6 + ".tar"):  # of a sweep with fewer complete runs or smaller shards
-        if file not in made:
-            file.unlink()
+                tar.write(_sample(data, index, frames))
+    for path in target.glob("[0-9]" * 6 + ".tar"):  # of a sweep with fewer complete runs or smaller shards
+        if path not in made:
+            path.unlink()
     return made
 
 
-def _add_run(tar: tarfile.TarFile, data: SweepDataset, index: int, frames: bool) -> None:
+def _sample(data: SweepDataset, index: int, frames: bool) -> dict[str, Any]:
     item, run = data[index], data.runs[index]
-    summary = dict(zip(data.summary_names, item["summary"].tolist(), strict=True))
     told = {"run": run, "settings": data.settings[index], "parameter_names": data.parameter_names}
-    told["summary"] = {name: None if value != value else value for name, value in summary.items()}  # NaN is not JSON
-    _add(tar, f"{run}.json", json.dumps(told).encode())
-    for name in ("parameters", "positions", "nodes"):
-        if name in item:
-            _add(tar, f"{run}.{name}.npy", _npy(item[name].numpy()))
-    pictures = sorted((data.folder / RUNS / run / "frames").glob("[0-9]*.png")) if frames else []
+    told["summary"] = without_nan(dict(zip(data.summary_names, item["summary"].tolist(), strict=True)))
+    sample = {"__key__": run, "json": told}
+    sample |= {f"{name}.npy": item[name].numpy() for name in ("parameters", "positions", "nodes") if name in item}
+    pictures = _pictures(data.folder, run) if frames else []
     if frames and not pictures:
         raise ValueError(f"Run {run} has no pictures: leave out `frames`, or sweep with recorder.renders of color.")
-    for picture in pictures:
-        _add(tar, f"{run}.{picture.name}", picture.read_bytes())
+    return sample | {picture.name: picture.read_bytes() for picture in pictures}
 
 
-def _npy(values: np.ndarray[Any, Any]) -> bytes:
-    buffer = io.BytesIO()
-    np.save(buffer, values)
-    return buffer.getvalue()
+def _pictures(folder: Path, run: str) -> list[Path]:
+    return sorted((folder / RUNS / run / "frames").glob("[0-9]*.png"))
 
-
-def _add(tar: tarfile.TarFile, name: str, content: bytes) -> None:
-    entry = tarfile.TarInfo(name)
-    entry.size = len(content)
-    tar.addfile(entry, io.BytesIO(content))
-
-
-if TYPE_CHECKING:
-    from PIL.Image import Image
 
 PICTURES = ("last", "middle")
 PER_SHEET = 200  # runs
@@ -259,7 +247,7 @@ def _frame(folder: Path, name: str, picture: str) -> Image | None:
     result = read_result(folder, name)
     if result is None or result["status"] != "complete":
         return None
-    files = sorted((folder / RUNS / name / "frames").glob("[0-9]*.png"))
+    files = _pictures(folder, name)
     if not files:
         return None
     with Image.open(files[-1] if picture == "last" else files[len(files) // 2]) as image:

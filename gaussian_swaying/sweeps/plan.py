@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gaussian_swaying._checks import check_choice, check_whole
 from gaussian_swaying._files import sha256
 from gaussian_swaying._inputs import check_regular
 from gaussian_swaying._yaml_limits import read_fields
@@ -20,9 +21,12 @@ from gaussian_swaying.config.parser import check_settings, config_text, option, 
 from gaussian_swaying.simulation.model import POLAR, in_settings
 from gaussian_swaying.simulation.simulation import Simulation
 
+if TYPE_CHECKING:
+    from jsonargparse import ArgumentParser, Namespace
+
 MOST_RUNS = 100_000
-SCALES = ("linear", "log")
-DRAWS = ("uniform", "log", "integer", "choice")
+FIELDS = ("base", "settings", "axes", "draws", "seed")
+NOT_HERE = ("config", "output", "resume", "device", "preset")
 
 
 @dataclass(frozen=True)
@@ -63,9 +67,7 @@ def read_axis(name: str, given: Any) -> Axis:
             f"Expected `{where}` to be a list of values, a range such as {{from: 1, to: 9, count: 5}}, or a draw such "
             f"as {{draw: uniform, low: 1, high: 9}}, but got {given!r}: for one value write [{given}]."
         )
-    if "draw" in given:
-        return Axis(name, draw=_draw(where, given))
-    return Axis(name, _range(where, given))
+    return Axis(name, draw=_draw(where, given)) if "draw" in given else Axis(name, _range(where, given))
 
 
 def runs_of(axes: list[Axis], draws: int = 1, seed: int = 0) -> list[dict[str, Any]]:
@@ -85,46 +87,40 @@ def runs_of(axes: list[Axis], draws: int = 1, seed: int = 0) -> list[dict[str, A
         >>> runs_of([Axis("a", (1, 2)), Axis("b", (3, 4))])
         [{'a': 1, 'b': 3}, {'a': 1, 'b': 4}, {'a': 2, 'b': 3}, {'a': 2, 'b': 4}]
     """
-    drawn = [axis for axis in axes if axis.draw is not None]
-    if draws > 1 and not drawn:
+    lists = [axis for axis in axes if axis.draw is None]
+    if draws > 1 and len(lists) == len(axes):
         raise ValueError(f"Expected an axis with a `draw`, as `draws` is {draws}: add one, or set `draws` to 1.")
-    count = math.prod(len(axis.values) for axis in axes if axis.draw is None) * draws
+    count = math.prod(len(axis.values) for axis in lists) * draws
     if count > MOST_RUNS:
         raise ValueError(f"The axes make {count:,} runs, more than the limit of {MOST_RUNS:,}: give fewer values.")
-    choices = [range(draws) if axis.draw is not None else axis.values for axis in axes]
-    fixed = [choice for choice, axis in zip(choices, axes, strict=True) if axis.draw is None]
     runs = []
-    for number, (*values, _) in enumerate(itertools.product(*fixed, range(draws))):
-        left = iter(values)
-        run = {}
-        for axis in axes:
-            if axis.draw is None:
-                run[axis.name] = next(left)
-            else:
-                run[axis.name] = axis.draw(random.Random(f"{seed}/{axis.name}/{number}"))
-        runs.append(run)
+    for number, (*values, _) in enumerate(itertools.product(*(axis.values for axis in lists), range(draws))):
+        listed = iter(values)
+        runs.append(
+            {
+                axis.name: axis.draw(random.Random(f"{seed}/{axis.name}/{number}")) if axis.draw else next(listed)
+                for axis in axes
+            }
+        )
     return runs
 
 
 def _range(where: str, given: Mapping[str, Any]) -> tuple[float, ...]:
     _only(where, given, "from", "to", "count", "scale")
-    low, high, count = _number(where, given, "from"), _number(where, given, "to"), _whole(where, given, "count")
-    if not 1 < count <= MOST_RUNS:
+    count, scale = given.get("count"), given.get("scale", "linear")
+    if isinstance(count, bool) or not isinstance(count, int) or not 1 < count <= MOST_RUNS:
         raise ValueError(
-            f"Expected `{where}.count` to be between 2 and {MOST_RUNS:,}, but got {count}: for one value use a list."
+            f"Expected `{where}.count` to be a whole number from 2 to {MOST_RUNS:,}, but got {count!r}: for one value "
+            "use a list."
         )
-    scale = _one_of(where, given, "scale", SCALES, "linear")
-    parts = [index / (count - 1) for index in range(count)]
-    if scale == "log":
-        _check_logarithm(where, "from", low, "to", high, "scale: linear")
-        inner = [low * (high / low) ** part for part in parts]
-    else:
-        inner = [low + (high - low) * part for part in parts]
-    return (low, *(_tidy(value) for value in inner[1:-1]), high)
+    check_choice(f"{where}.scale", scale, ("linear", "log"))
+    low, high, between = _between(where, given, "from", "to", scale, "scale: linear")
+    return (low, *(between(index / (count - 1)) for index in range(1, count - 1)), high)
 
 
 def _draw(where: str, given: Mapping[str, Any]) -> Callable[[random.Random], Any]:
-    kind = _one_of(where, given, "draw", DRAWS)
+    kind = given["draw"]
+    check_choice(f"{where}.draw", kind, ("uniform", "log", "integer", "choice"))
     if kind == "choice":
         _only(where, given, "draw", "of")
         choices = given.get("of")
@@ -132,29 +128,41 @@ def _draw(where: str, given: Mapping[str, Any]) -> Callable[[random.Random], Any
             raise ValueError(f"Expected `{where}.of` to be a list of values to choose from, but got {choices!r}.")
         return lambda stream: choices[stream.randrange(len(choices))]
     _only(where, given, "draw", "low", "high")
-    take = _whole if kind == "integer" else _number
-    low, high = take(where, given, "low"), take(where, given, "high")
+    low, high, between = _between(where, given, "low", "high", kind, "draw: uniform")
     if low > high:
         raise ValueError(f"Expected `{where}.low` to be at most `high`, but got {low} and {high}: exchange them.")
     if kind == "integer":
-        return lambda stream: stream.randint(int(low), int(high))
-    if kind == "log":
-        _check_logarithm(where, "low", low, "high", high, "draw: uniform")
-        return lambda stream: _tidy(low * (high / low) ** stream.random())
-    return lambda stream: _tidy(low + (high - low) * stream.random())
+        for name in ("low", "high"):
+            check_whole(f"{where}.{name}", given[name], -(1 << 63))
+        return lambda stream: stream.randint(given["low"], given["high"])
+    return lambda stream: between(stream.random())
 
 
-def _tidy(value: float) -> float:
-    """Round to 12 digits, so that powers computed by another machine's C library give the same number."""
-    return float(f"{value:.12g}")
-
-
-def _check_logarithm(where: str, first: str, low: float, second: str, high: float, remedy: str) -> None:
-    if low <= 0 or high <= 0:
+def _between(
+    where: str, given: Mapping[str, Any], first: str, last: str, scale: str, remedy: str
+) -> tuple[float, float, Callable[[float], float]]:
+    """Both ends, and the value at a share of the way between them, to 12 digits: C libraries differ in powers."""
+    ends = []
+    for name in (first, last):
+        value = given.get(name)
+        try:
+            number = math.nan if isinstance(value, bool) else float(value)  # type: ignore[arg-type]
+        except (ValueError, TypeError, OverflowError):
+            number = math.nan
+        if not math.isfinite(number):
+            raise ValueError(f"Expected `{where}.{name}` to be a finite number, but got {value!r}: set it.")
+        ends.append(number)
+    low, high = ends
+    if scale == "log" and min(ends) <= 0:
         raise ValueError(
-            f"Expected `{where}.{first}` and `{second}` to be positive on a logarithmic scale, but got {low} and "
+            f"Expected `{where}.{first}` and `{last}` to be positive on a logarithmic scale, but got {low} and "
             f"{high}: use {remedy}."
         )
+
+    def between(part: float) -> float:
+        return float(f"{low * (high / low) ** part if scale == 'log' else low + (high - low) * part:.12g}")
+
+    return low, high, between
 
 
 def _only(where: str, given: Mapping[str, Any], *known: str) -> None:
@@ -163,48 +171,14 @@ def _only(where: str, given: Mapping[str, Any], *known: str) -> None:
             raise ValueError(f"`{where}` has an unknown entry `{name}`: use {', '.join(known)}.")
 
 
-def _number(where: str, given: Mapping[str, Any], name: str) -> float:
-    value = given.get(name)
-    try:
-        if isinstance(value, bool) or not isinstance(value, (int, float, str)):  # YAML reads 1e3 as text
-            raise ValueError
-        number = float(value)
-        if not math.isfinite(number):
-            raise ValueError
-    except (ValueError, OverflowError):
-        raise ValueError(f"Expected `{where}.{name}` to be a finite number, but got {value!r}: set it.") from None
-    return number
-
-
-def _whole(where: str, given: Mapping[str, Any], name: str) -> int:
-    value = given.get(name)
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise ValueError(f"Expected `{where}.{name}` to be a whole number, but got {value!r}: set it.")
-    return value
-
-
-def _one_of(where: str, given: Mapping[str, Any], name: str, known: tuple[str, ...], default: str | None = None) -> str:
-    value = given.get(name, default)
-    if value not in known:
-        raise ValueError(f"Expected `{where}.{name}` to be one of {', '.join(known)}, but got {value!r}.")
-    return str(value)
-
-
-if TYPE_CHECKING:
-    from jsonargparse import ArgumentParser, Namespace
-
-FIELDS = ("base", "settings", "axes", "draws", "seed")
-NOT_HERE = ("config", "output", "resume", "device", "preset")
-
-
 @dataclass(frozen=True)
 class Sweep:
     """A sweep file as it is written.
 
     Args:
         base: Configuration files of ``sim``; later ones override earlier ones.
-        settings: Options of ``sim`` for all runs, by their names on the command line.
         runs: The value of every axis in each run, see :func:`~gaussian_swaying.sweeps.plan.runs_of`.
+        settings: Options of ``sim`` for all runs, by their names on the command line.
     """
 
     base: Sequence[str]
@@ -233,10 +207,6 @@ class Plan:
         """Names of the runs and their folders: 00000, 00001 ..."""
         return [f"{number:05d}" for number in range(len(self.runs))]
 
-    @property
-    def axes(self) -> list[str]:
-        return list(self.runs[0])
-
 
 def read_sweep(path: str | os.PathLike[str], find: Callable[[str], str] = str) -> Sweep:
     """Read a sweep file.
@@ -260,12 +230,12 @@ def read_sweep(path: str | os.PathLike[str], find: Callable[[str], str] = str) -
         raise ValueError(
             f"Expected `axes` in {file} to have at least one option that differs between the runs: add it."
         )
-    both = [name for name in axes if name in settings]
-    if both:
-        raise ValueError(f"`{both[0]}` is in `settings` and in `axes` of {file}: remove one of the two.")
-    draws, seed = (_count(file, name, given.get(name, start)) for name, start in (("draws", 1), ("seed", 0)))
-    if draws < 1:
-        raise ValueError(f"Expected `draws` in {file} to be at least 1, but got {draws}.")
+    for name in axes:
+        if name in settings:
+            raise ValueError(f"`{name}` is in `settings` and in `axes` of {file}: remove one of the two.")
+    draws, seed = given.get("draws", 1), given.get("seed", 0)
+    check_whole("draws", draws, 1)
+    check_whole("seed", seed, -(1 << 63))
     runs = runs_of([read_axis(name, entry) for name, entry in axes.items()], draws, seed)
     return Sweep([find(name) for name in base], runs, settings)
 
@@ -290,7 +260,8 @@ def make_plan(sweep: Sweep, parser: ArgumentParser | None = None) -> Plan:
             settings = parse_run(parser, config, shared.frames, sweep.runs[number])
         except (ArgumentError, ValueError) as error:
             shown = ", ".join(f"{name}: {value}" for name, value in sweep.runs[number].items())
-            raise type(error)(*_located(error, f"Run {number:05d} ({shown}): ")) from error
+            told = f"Run {number:05d} ({shown}): {error}"
+            raise (ArgumentError(None, told) if isinstance(error, ArgumentError) else type(error)(told)) from error
         splats.add(settings.scene.ply)
     checksums = {path: sha256(check_regular(path, "the splat")) for path in sorted(filter(None, splats))}
     return Plan(config, shared.frames, tuple(sweep.runs), checksums)
@@ -312,11 +283,6 @@ def parse_run(parser: ArgumentParser, config: str, frames: int, run: Mapping[str
     in_settings(settings, own)
     check_settings(Simulation, settings)
     return settings
-
-
-def _located(error: Exception, where: str) -> tuple[Any, ...]:
-    """Return the arguments of the same error, with a message that begins with a location."""
-    return (None, f"{where}{error}") if isinstance(error, ArgumentError) else (f"{where}{error}",)
 
 
 def _telling(runs: Sequence[Mapping[str, Any]]) -> list[int]:
@@ -352,9 +318,3 @@ def _options(file: Path, field_: str, given: Any) -> dict[str, Any]:
     except (TypeError, ValueError) as error:
         raise ValueError(f"`{field_}` of {file} has a value that is no number, text or list ({error}).") from None
     return given
-
-
-def _count(file: Path, name: str, value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise ValueError(f"Expected `{name}` in {file} to be a whole number, but got {value!r}: set it.")
-    return value

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping, Sequence
-from importlib.util import find_spec
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +19,9 @@ from gaussian_swaying.runs.folder import hold_folder
 from gaussian_swaying.runs.lock import FolderLock
 from gaussian_swaying.sweeps.plan import Plan
 
-SWEEP, TABLE, TIMES = "sweep.json", "sweep.csv", "times.csv"
-PARQUET = "sweep.parquet"
-RUNS, RESULTS, LOGS, SHARES = "runs", "results", "logs", "parts"
-OURS = (SWEEP, TABLE, TIMES, PARQUET, RUNS, RESULTS, LOGS)
+SWEEP, TABLE, PARQUET = "sweep.json", "sweep.csv", "sweep.parquet"
+RUNS, RESULTS, LOGS = "runs", "results", "logs"
+OURS = (SWEEP, TABLE, PARQUET, RUNS, RESULTS, LOGS)
 FIGURES = (
     "frames",
     "substeps",
@@ -43,14 +41,11 @@ FIGURES = (
 """Entries of ``summary.json`` in the table; none of them is a time of the clock."""
 
 ENERGIES = ("kinetic", "elastic", "potential")
-PARTS = ("startup", "simulation", "shading", "rendering", "writing")
 SUMMARY = (*FIGURES, *(f"{name}_end_J" for name in ENERGIES), "warnings")
 """Columns of the table after the axes."""
 
 
-def open_folder(
-    folder: Path, plan: Plan, resume: bool, together: int = 1, part: tuple[int, int] | None = None
-) -> FolderLock:
+def open_folder(folder: Path, plan: Plan, resume: bool, together: int = 1) -> FolderLock:
     """Make and lock the folder of a sweep, or lock the one that is continued.
 
     Args:
@@ -58,20 +53,18 @@ def open_folder(
         plan: The sweep.
         resume: Whether to continue the sweep in it.
         together: Largest number of runs that are simulated together, on which the results depend.
-        part: Number of a part and how many there are. Other processes do the others in the same folder: only the part
-            is locked then, and it does not matter whether the sweep has begun.
 
     Returns:
         The lock, to be released at the end.
     """
-    foreign = [name for name in OURS if os.path.lexists(folder / name)]  # before `held`, as another part may begin
     held = (folder / SWEEP).exists()
-    if resume and not held and part is None:
+    if resume and not held:
         raise ValueError(f"There is nothing to resume in {folder}: it has no {SWEEP}; leave out --resume.")
-    if held and not resume and part is None:
+    if held and not resume:
         raise ValueError(
             f"{folder} holds a sweep already: add --resume to do what is missing in it, or choose another --output."
         )
+    foreign = [name for name in OURS if os.path.lexists(folder / name)]
     if foreign and not held:
         raise ValueError(
             f"The output folder {folder} contains {', '.join(foreign)} of something else: choose another --output."
@@ -79,36 +72,23 @@ def open_folder(
     new = _described(plan) | ({"together": together} if together > 1 else {})
     if held:
         _check_same(folder, new)
-    own = folder if part is None else folder / SHARES / f"{part[0]}of{part[1]}"
     try:
-        own.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ValueError(
             f"The output folder {folder} cannot be written ({error.strerror or error}): choose another with --output."
         ) from error
-    lock = hold_folder(own, "choose another with --output" if part is None else "wait for that part")
+    lock = hold_folder(folder, "choose another with --output")
     try:
-        remove_temporaries(own)  # of a sweep that was killed while writing
+        remove_temporaries(folder)  # of a sweep that was killed while writing
         if not held:
-            _begin(folder, own, new)
+            write_json(folder / SWEEP, new)
         for name in (RUNS, RESULTS, LOGS):
             (folder / name).mkdir(exist_ok=True)
     except BaseException:
         lock.release()
         raise
     return lock
-
-
-def _begin(folder: Path, own: Path, new: dict[str, Any]) -> None:
-    """Write ``sweep.json``; of several parts that begin at the same moment, the first one does."""
-    write_json(own / SWEEP, new)
-    if own != folder:
-        try:
-            os.link(own / SWEEP, folder / SWEEP)
-        except FileExistsError:
-            _check_same(folder, new)
-        except OSError:  # a file system without links
-            os.replace(own / SWEEP, folder / SWEEP)
 
 
 def read_record(folder: Path) -> dict[str, Any]:
@@ -167,7 +147,7 @@ def read_result(folder: Path, name: str) -> dict[str, Any] | None:
     raise ValueError(f"{path} is damaged ({why}): remove it, and --resume does its run again.")
 
 
-def result_of(summary: Mapping[str, Any], attempt: int, where: str = "") -> dict[str, Any]:
+def result_of(summary: Mapping[str, Any], attempt: int, where: str) -> dict[str, Any]:
     """The result of a complete run.
 
     Args:
@@ -179,97 +159,49 @@ def result_of(summary: Mapping[str, Any], attempt: int, where: str = "") -> dict
     end = summary.get("energy_end_J") or {}
     figures |= {f"{name}_end_J": end.get(name) for name in ENERGIES}
     figures["warnings"] = len(summary.get("warnings") or ())
-    return {
-        "status": summary["status"],
-        "reason": None,
-        "figures": figures,
-        "attempts": attempt,
-        "where": where,
-        "wall_s": summary.get("wall_s"),
-        "peak_memory_bytes": summary.get("peak_memory_bytes"),
-    }
+    result = {"status": summary["status"], "reason": None, "figures": figures, "attempts": attempt, "where": where}
+    return result | {name: summary.get(name) for name in ("wall_s", "peak_memory_bytes")}
 
 
 def failure(status: str, reason: str, attempt: int) -> dict[str, Any]:
-    """The result of a run that failed.
-
-    Args:
-        status: ``failed`` or ``diverged``.
-        reason: One sentence.
-        attempt: Number of times that it was begun.
-    """
+    """The result of a run that is ``failed`` or ``diverged``, with one sentence why."""
     return {"status": status, "reason": reason, "attempts": attempt}
 
 
-# ---- tables
-def write_tables(
-    folder: Path, names: Sequence[str], runs: Sequence[Mapping[str, Any]], results: Mapping[str, Any]
-) -> None:
-    """Write ``sweep.csv``, a row per run in their order, and ``times.csv`` with what differs from machine to machine.
+def write_tables(folder: Path, plan: Plan, results: Mapping[str, Any], parquet: bool = False) -> None:
+    """Write ``sweep.csv``, a row per run in their order; and ``sweep.parquet`` with numbers and lists as such.
 
     Args:
         folder: Folder of the sweep.
-        names: Names of the runs.
-        runs: The value of every axis in each run.
+        plan: The sweep.
         results: Result of each run that has one, by name.
+        parquet: Whether to write the second.
     """
-    table, times = [], []
-    for name, run in zip(names, runs, strict=True):
-        result = results.get(name) or {"status": "missing", "reason": None}
+    rows = []
+    for name, run in zip(plan.names, plan.runs, strict=True):
+        result = results.get(name) or {"status": "missing"}
         figures = result.get("figures") or {}
-        row = {"run": name, "status": result["status"], "reason": result.get("reason")}
-        row |= {axis: _cell(value) for axis, value in run.items()}
-        table.append(row | {column: _cell(figures.get(column)) for column in SUMMARY})
-        walls, peak = result.get("wall_s") or {}, result.get("peak_memory_bytes") or {}
-        clock = {"run": name, "attempts": result.get("attempts"), "where": result.get("where")}
-        clock |= {f"{part}_s": walls.get(part) for part in PARTS}
-        times.append(clock | {f"{where}_bytes": peak.get(where) for where in ("host", "device")})
-    write_table(folder / TABLE, table)
-    write_table(folder / TIMES, times)
+        row: dict[str, Any] = {"run": name, "status": result["status"], "reason": result.get("reason")}
+        rows.append(row | dict(run) | {column: figures.get(column) for column in SUMMARY})
+    write_table(folder / TABLE, [{name: _cell(value) for name, value in row.items()} for row in rows])
+    if parquet:
+        import pyarrow
+        import pyarrow.parquet
+
+        columns = {name: _column(name, [row[name] for row in rows]) for name in rows[0]}
+        with atomic(folder / PARQUET) as temporary:
+            pyarrow.parquet.write_table(pyarrow.table(columns), temporary)
 
 
-def check_parquet() -> None:
-    """Raise ValueError if pyarrow is missing."""
-    if find_spec("pyarrow") is None:
-        raise ValueError("`--parquet` needs pyarrow: install gaussian-swaying[parquet], or use sweep.csv.")
-
-
-def write_parquet(
-    folder: Path, names: Sequence[str], runs: Sequence[Mapping[str, Any]], results: Mapping[str, Any]
-) -> None:
-    """Write ``sweep.parquet``: the rows and columns of ``sweep.csv``, with typed numbers and lists of numbers.
-
-    Args:
-        folder: Folder of the sweep.
-        names: Names of the runs.
-        runs: The value of every axis in each run.
-        results: Result of each run that has one, by name.
-    """
+def _column(name: str, values: list[Any]) -> Any:
     import pyarrow
-    import pyarrow.parquet
 
-    ordered = [results.get(name) or {"status": "missing"} for name in names]
-    columns: dict[str, list[Any]] = {"run": list(names)}
-    columns |= {name: [result.get(name) for result in ordered] for name in ("status", "reason")}
-    columns |= {axis: _typed([run[axis] for run in runs]) for axis in runs[0]}
-    columns |= {name: _typed([(result.get("figures") or {}).get(name) for result in ordered]) for name in SUMMARY}
-    text = pyarrow.schema([(name, pyarrow.string()) for name in ("status", "reason")])
-    kinds = {name: text.field(name).type for name in text.names}
-    arrays = {name: pyarrow.array(values, kinds.get(name)) for name, values in columns.items()}
-    with atomic(folder / PARQUET) as temporary:
-        pyarrow.parquet.write_table(pyarrow.table(arrays), temporary)
-
-
-def _typed(values: list[Any]) -> list[Any]:
-    """Values of one type: whole numbers, numbers, lists of numbers, or else text."""
-    given = [value for value in values if value is not None]
-    if all(type(value) is int for value in given):
-        return values
-    if all(type(value) in (int, float) for value in given):
-        return [None if value is None else float(value) for value in values]
-    if all(isinstance(v, list) and all(type(x) in (int, float) for x in v) for v in given):
-        return [None if value is None else [float(x) for x in value] for value in values]
-    return [_cell(value) for value in values]
+    if name in ("status", "reason") or any(isinstance(value, dict) for value in values):
+        return pyarrow.array([_cell(value) for value in values], pyarrow.string())
+    try:
+        return pyarrow.array(values)
+    except pyarrow.ArrowException:  # numbers and text, say
+        return pyarrow.array([_cell(value) for value in values])
 
 
 def _cell(value: Any) -> Any:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import time
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,27 +11,50 @@ from typing import Any, Literal
 
 import lightning
 import torch
+from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor
 from torchmetrics.functional.image import peak_signal_noise_ratio
 
-from gaussian_swaying._checks import check_choice, check_positive, check_vector
+from gaussian_swaying._checks import check_positive, check_vector
+from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.geometry.origin import NO_ORIGIN
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.gsplat_renderer import make_renderer
 from gaussian_swaying.rendering.planes import SurfaceMaps, plane_channels, surface_maps
 from gaussian_swaying.rendering.protocol import SplatOutput, SplatRenderer
-from gaussian_swaying.training.checkpoints import check_settings, newest_checkpoint, stored_gaussians
 from gaussian_swaying.training.densification import PARAMETERS, DefaultDensification, Densification
-from gaussian_swaying.training.finite import PendingLoss, TrainingDiverged, finite_cloud
 from gaussian_swaying.training.initial import gaussians_from_file
 from gaussian_swaying.training.losses import LossInputs, LossTerm, OtherView, TotalLoss
-from gaussian_swaying.training.optimizers import OPTIMIZERS, GaussianAdam, LearningRates, means_rate
+from gaussian_swaying.training.optimizers import GaussianAdam, LearningRates, means_rate
 from gaussian_swaying.training.panels import lpips_metric, panel, picture_metrics, write_panel
-from gaussian_swaying.training.parallel import check_alike, seen_by_any, share_gradients, steps_of
-from gaussian_swaying.training.random_stream import mixed_seed, random_stream
-from gaussian_swaying.training.strategy import check_strategy
+from gaussian_swaying.training.parallel import share_gradients, steps_of
 from gaussian_swaying.training.surface_losses import SurfaceTerm as SurfaceTerm  # so that a YAML finds its terms
+
+
+class SplatParallel(DDPStrategy):
+    """Lightning's DDP without its wrapper, which would keep the Gaussians of the start: densification replaces them."""
+
+    def configure_ddp(self) -> None:
+        """Nothing is wrapped."""
+
+
+class TrainingDiverged(RuntimeError):  # noqa: N818
+    """A loss or a Gaussian is no longer finite; the message names the step and the last good checkpoint.
+
+    Args:
+        step: Number of images trained on before the one that failed.
+        what: Name of the value that is not finite.
+        checkpoint: Last checkpoint written before, if any.
+    """
+
+    def __init__(self, step: int, what: str, checkpoint: str | None = None) -> None:
+        self.step, self.checkpoint = step, checkpoint
+        kept = f"the last good checkpoint is {checkpoint}" if checkpoint else "there is no checkpoint yet"
+        super().__init__(
+            f"Training diverged at step {step}: {what} is not finite; {kept}. Remedy: lower the learning rates "
+            "(`model.rates`) or the weight of the loss that grew (`model.loss_weights`)."
+        )
 
 
 class SplatTrainer(lightning.LightningModule):
@@ -40,8 +62,8 @@ class SplatTrainer(lightning.LightningModule):
 
     A step is one image. On several devices a step of Lightning takes one image on each, see
     :mod:`~gaussian_swaying.training.parallel`: then the trainer's ``max_steps`` and intervals count its steps, and all
-    that is given here in steps still counts images. Random numbers come from a separate stream, which starts from the
-    seed and is stored in checkpoints. So nothing else changes them, and a resumed run continues exactly.
+    that is given here in steps still counts images. Random numbers of a step follow from the seed and its number, so
+    that a resumed run continues exactly.
 
     Batches have items ``image`` (H, W, 3), ``alpha`` (H, W, 1) or None, ``camera`` and ``name``. If there is an alpha,
     the colours of the image are not premultiplied. Losses that compare two views also need the item ``index``, and
@@ -63,15 +85,12 @@ class SplatTrainer(lightning.LightningModule):
         seed: Seed of backgrounds and new Gaussians.
         panels: Number of validation images written as panels of photo, render, normals and area.
         log_every: Steps between logged values.
-        optimizer: See :class:`~gaussian_swaying.training.optimizers.GaussianAdam`; ``selective_adam`` needs CUDA.
         packed: Keep values of the Gaussians in the picture alone: less memory on a GPU, one more wait.
-        output: Folder of the panels and the final ``point_cloud.ply``; ``trainer.default_root_dir`` by default.
         init_ply: Splat with the initial Gaussians.
         lpips: Backbone of the LPIPS metric, used only if its weights are on disk; null for none.
 
     Attributes:
         renderer: The renderer; None for that of :func:`~gaussian_swaying.rendering.gsplat_renderer.make_renderer`.
-        saved_step: Lightning's number of steps when the last checkpoint was written; None before.
 
     Raises:
         ValueError: If a value is out of range.
@@ -92,9 +111,7 @@ class SplatTrainer(lightning.LightningModule):
         seed: int = 0,
         panels: int = 3,
         log_every: int = 50,
-        optimizer: Literal["adam", "selective_adam"] = "adam",
         packed: bool = False,
-        output: str | None = None,
         init_ply: str | None = None,
         lpips: Literal["alex", "vgg", "squeeze"] | None = "alex",
     ) -> None:
@@ -104,8 +121,6 @@ class SplatTrainer(lightning.LightningModule):
         for name, value in (("sh_every", sh_every), ("panels", panels), ("seed", seed)):
             check_positive(name, value, allow_zero=True)
         check_positive("log_every", log_every)
-        check_choice("optimizer", optimizer, OPTIMIZERS)
-        self.optimizer, self.packed = optimizer, packed
         if scene_scale is not None:
             check_positive("scene_scale", scene_scale)
         self.automatic_optimization = False
@@ -122,19 +137,15 @@ class SplatTrainer(lightning.LightningModule):
         self._black = max(fixed) == 0.0
         self.scene_scale = scene_scale
         self.seed, self.panels, self.log_every = seed, panels, log_every
-        self.output, self.init_ply = output, init_ply
+        self.packed, self.init_ply = packed, init_ply
         self.model: GaussianSurfaceModel | None = None
-        self._metrics: dict[str, list[Tensor]] = {}  # of each image of an evaluation
         self._lpips_net = lpips
         self._lpips: list[Any] = []  # in a list, so that its weights are not stored in checkpoints
         self.renderer = None
-        self.saved_step: int | None = None
         self._made: dict[str, SplatRenderer] = {}  # by kind of device: Lightning moves the model after a fit
-        self._pending: PendingLoss | None = None
         self._fitting = False
         self._seen = 0  # number of images that the checkpoint was trained on
-        self._begun = 0  # [ns] start of the training
-        self._random: dict[str, Tensor] = {}  # state of the generators between two steps, by kind of device
+        self._saved: str | None = None  # the last checkpoint
 
     fixed_background: Tensor
 
@@ -170,12 +181,15 @@ class SplatTrainer(lightning.LightningModule):
         assert self.scene_scale is not None
         rates = vars(self.rates) | {"means": self.rates.means * self.scene_scale}
         parameters = [getattr(self.splat, name) for name in PARAMETERS]
-        return GaussianAdam(parameters, [rates[name] for name in PARAMETERS], self.optimizer, self.devices)
+        return GaussianAdam(parameters, [rates[name] for name in PARAMETERS], self.devices)
 
     def on_fit_start(self) -> None:
         """Refuse settings that would silently train wrongly."""
-        self._begun = time.time_ns()
-        check_strategy(self.trainer)
+        if self.devices > 1 and not isinstance(self.trainer.strategy, SplatParallel):
+            raise ValueError(
+                "Expected `trainer.strategy` to be auto, or SplatParallel in Python, for several devices, but got "
+                f"{type(self.trainer.strategy).__name__}: Lightning's own ones keep the Gaussians of the start."
+            )
         if self.trainer.precision not in ("32-true", "32"):
             raise ValueError(
                 f"Expected `trainer.precision` to be 32-true, but got {self.trainer.precision}: splats need float32."
@@ -185,7 +199,6 @@ class SplatTrainer(lightning.LightningModule):
         """Attach the Gaussians and their optimiser to the densification, after a checkpoint has been read."""
         assert self.scene_scale is not None
         self.densification.attach(self.splat, self.trainer.optimizers[0], self.scene_scale, self.devices)
-        check_alike([getattr(self.splat, name) for name in PARAMETERS])
 
     @property
     def devices(self) -> int:
@@ -239,22 +252,17 @@ class SplatTrainer(lightning.LightningModule):
 
     def training_step(self, batch: Mapping[str, Any]) -> Tensor:
         """Train on an image: picture, losses, gradients, step of the optimiser, densification."""
-        with random_stream(self._random, self.device, self.seed):
-            return self._train_on(batch, self.global_step)
-
-    def _train_on(self, batch: Mapping[str, Any], step: int) -> Tensor:
+        step = self.global_step
         optimizer: Any = self.optimizers()  # Lightning's wrapper, whose step counts
         assert self.scene_scale is not None
         steps, images = int(self.trainer.max_steps), step * self.devices  # images before this step
-        if self.devices > 1:  # other backgrounds on each device
-            torch.manual_seed(mixed_seed(self.seed, step, 1 + self.global_rank))
+        self._seed(step, self.global_rank)  # other backgrounds on each device
         optimizer.param_groups[0]["lr"] = means_rate(self.rates, self.scene_scale, step, steps, self.devices)
         target, alpha, background = self._target(batch, train=True)
         needs = self.loss.needs(images)
         output = self.render(
             batch["camera"], background, self.active_degree(images), self.densification.absgrad, bool(needs)
         )
-        self._check_pending()  # of the previous step: gsplat has already waited for the GPU
         splat = self.splat
         camera, surface = self._surface(output, batch["camera"]) if needs else (None, None)
         inputs = LossInputs(
@@ -279,16 +287,11 @@ class SplatTrainer(lightning.LightningModule):
         mean = loss.detach()
         if self.devices > 1:
             mean = share_gradients([getattr(splat, name) for name in PARAMETERS], loss)
-            torch.manual_seed(mixed_seed(self.seed, step))  # the same changes on all devices
-        if self._pending is None:
-            self._pending = PendingLoss(self.device)
-        self._pending.send(images, mean)
-        if self.device.type != "cuda":
-            self._check_pending()
-        if self.optimizer == "adam":
-            optimizer.step()
-        else:
-            optimizer.step(seen=seen_by_any(output.screen.seen(len(splat))))
+            self._seed(step, 0)  # the same changes on all devices
+        logs = step % steps_of(self.log_every, self.devices) == 0 or step + 1 == steps
+        if (logs or self.device.type != "cuda") and not math.isfinite(mean):  # a GPU would wait for it
+            raise TrainingDiverged(images, "the loss", self.last_checkpoint())
+        optimizer.step()
         splat.zero_grad()
         self.densification.after_step(step, output.screen)
         if len(splat) == 0:
@@ -296,9 +299,12 @@ class SplatTrainer(lightning.LightningModule):
                 f"No Gaussian is left at step {images}: lower `densification.prune_opacity`, or the weights of the "
                 "losses that lower opacities."
             )
-        if step % steps_of(self.log_every, self.devices) == 0 or step + 1 == steps:
+        if logs:
             self._log_step(loss.detach(), terms, output.color.detach(), target)
         return loss.detach()
+
+    def _seed(self, step: int, rank: int) -> None:
+        torch.manual_seed(((self.seed * 1_000_003 + step) * 1_009 + rank) % 2**63)
 
     def _surface(self, output: SplatOutput, camera: Camera) -> tuple[Camera, SurfaceMaps]:
         assert output.channels is not None
@@ -345,28 +351,20 @@ class SplatTrainer(lightning.LightningModule):
         for logger in self.trainer.loggers:  # not self.log, which would write them again at every step
             logger.log_metrics({f"train/{name}": float(value) for name, value in values.items()}, self.global_step)
 
-    # ---- what is not finite
-
-    def _check_pending(self) -> None:
-        """Raise if the last loss was not finite: on a GPU one step later, so that nothing waits for it."""
-        step = None if self._pending is None else self._pending.step
-        if self._pending is not None and step is not None and not math.isfinite(self._pending.take()):
-            raise TrainingDiverged(step, "the loss", self.last_checkpoint())
+    # ---- checkpoints
 
     def last_checkpoint(self) -> str | None:
         """The newest checkpoint of this run, or the one that it resumes; None if there is none."""
-        return newest_checkpoint(self.trainer, self._begun)
-
-    # ---- checkpoints
+        resumed = self.trainer.ckpt_path
+        return self._saved or (None if resumed is None else str(resumed))
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add the state of the densification; refuse to write Gaussians that are not finite."""
-        self._check_pending()
         for name in PARAMETERS:
             if not bool(torch.isfinite(getattr(self.splat, name)).all()):
                 raise TrainingDiverged(self.global_step * self.devices, f"a value of `{name}`", self.last_checkpoint())
-        check_alike([getattr(self.splat, name) for name in PARAMETERS])
-        self.saved_step = self.global_step
+        kept: Any = self.trainer.checkpoint_callback
+        self._saved = getattr(kept, "best_model_path", None) or self._saved
         checkpoint["splat_training"] = {
             "devices": self.devices,
             "densification": self.densification.state_dict(),
@@ -375,7 +373,6 @@ class SplatTrainer(lightning.LightningModule):
             "sh_degree": self.sh_degree,
             "seed": self.seed,
             "origin": self.splat.origin,
-            "random": dict(self._random),
             "seen": self.global_step * self.devices,
         }
 
@@ -384,17 +381,28 @@ class SplatTrainer(lightning.LightningModule):
         stored = checkpoint.get("splat_training")
         if stored is None:
             raise ValueError("The checkpoint has no Gaussians: it was not written by this package.")
-        check_settings(stored, self.sh_degree, self.devices if self._fitting else None)
+        known = stored.get("devices", 1)
+        if stored["sh_degree"] != self.sh_degree:
+            raise ValueError(
+                f"The checkpoint was trained with `sh_degree` {stored['sh_degree']}, but the configuration says "
+                f"{self.sh_degree}: use the same."
+            )
+        if self._fitting and known != self.devices:
+            raise ValueError(
+                f"The checkpoint was trained on {known} devices, but there are {self.devices}: use `trainer.devices: "
+                f"{known}`."
+            )
         if self._fitting and len(checkpoint["optimizer_states"]) != 1:
             raise ValueError(
                 "The checkpoint is from an earlier version, with an optimiser for each parameter, so it cannot be "
                 "continued: start a new run, from its splat with `init_ply`."
             )
         device = self.device if self.model is None else self.model.means.device
-        cloud = stored_gaussians(checkpoint["state_dict"], stored.get("origin", NO_ORIGIN))
+        means, scales, quats, opacities, sh0, rest = (checkpoint["state_dict"][f"model.{name}"] for name in PARAMETERS)
+        origin = stored.get("origin", NO_ORIGIN)
+        cloud = GaussianCloud(means, quats, scales, opacities, torch.cat([sh0, rest], 1), origin=origin)
         self.model = GaussianSurfaceModel.from_cloud(cloud).to(device)
         self.scene_scale, self.seed = stored["scene_scale"], stored["seed"]
-        self._random.update({name: state.cpu() for name, state in stored["random"].items()})
         self._seen = int(stored["seen"])
         if stored["kind"] == type(self.densification).__name__:
             self.densification.load_state_dict(stored["densification"])
@@ -403,71 +411,41 @@ class SplatTrainer(lightning.LightningModule):
 
     # ---- evaluation
 
-    def on_validation_epoch_start(self) -> None:
-        """Reset the metrics."""
-        if self._lpips_net is not None:
-            metric = lpips_metric(self._lpips_net)
-            self._lpips_net = None
-            self._lpips = [] if metric is None else [metric]
-        self._metrics = {}
-
     def validation_step(self, batch: Mapping[str, Any], batch_idx: int) -> None:
         """Metrics of one image, and its panel."""
         self._evaluate(batch, batch_idx, "val")
 
-    def on_validation_epoch_end(self) -> None:
-        """Log the means over the images."""
-        self._log_metrics("val")
-
-    def on_test_epoch_start(self) -> None:
-        """Reset the metrics."""
-        self.on_validation_epoch_start()
-
     def test_step(self, batch: Mapping[str, Any], batch_idx: int) -> None:
         """Metrics of one image, and its panel."""
         self._evaluate(batch, batch_idx, "test")
-
-    def on_test_epoch_end(self) -> None:
-        """Log the means over the images."""
-        self._log_metrics("test")
 
     def _evaluate(self, batch: Mapping[str, Any], batch_idx: int, stage: str) -> None:
         target, _, background = self._target(batch, train=False)
         images = self.global_step * self.devices if self._fitting else self._seen
         degree = self.active_degree(max(images - 1, 0)) if self._fitting else self._degree_reached()
         image = self.render(batch["camera"], background, degree).color.clamp(0.0, 1.0)
+        if self._lpips_net is not None:
+            metric, self._lpips_net = lpips_metric(self._lpips_net), None
+            self._lpips = [] if metric is None else [metric]
         lpips = self._lpips[0].to(self.device) if self._lpips else None
         for name, value in picture_metrics(image, target, lpips).items():
-            self._metrics.setdefault(name, []).append(value)
+            self.log(f"{stage}/{name}", value, prog_bar=name == "psnr", batch_size=1)
+        self.log(f"{stage}/gaussians", float(len(self.splat)), batch_size=1)
         if batch_idx < self.panels and not self.trainer.sanity_checking and self.trainer.is_global_zero:
-            self._write_panel(batch, target, image, f"{stage}_{batch_idx:02d}", images)
-
-    def _log_metrics(self, stage: str) -> None:
-        for name, values in self._metrics.items():
-            self.log(f"{stage}/{name}", torch.stack(values).mean(), prog_bar=name == "psnr")
-        self.log(f"{stage}/gaussians", float(len(self.splat)))
+            pictures = panel(self.splat, self._drawing(), batch["camera"], target, image)
+            folder = Path(self.trainer.default_root_dir) / "panels"
+            write_panel(pictures, folder, f"{stage}_{batch_idx:02d}", images, self.trainer.loggers)
 
     def _degree_reached(self) -> int:
         """Degree in use when the checkpoint was written; the full degree without a checkpoint."""
         return self.sh_degree if self._seen == 0 else self.active_degree(self._seen - 1)
 
-    def _write_panel(self, batch: Mapping[str, Any], target: Tensor, image: Tensor, name: str, step: int) -> None:
-        pictures = panel(self.splat, self._drawing(), batch["camera"], target, image)
-        write_panel(pictures, self.folder / "panels", name, step, self.trainer.loggers)
-
     # ---- the end
 
-    @property
-    def folder(self) -> Path:
-        """The output folder."""
-        return Path(self.output if self.output is not None else self.trainer.default_root_dir)
-
     def on_train_end(self) -> None:
-        """Check the last loss and write ``point_cloud.ply``."""
-        self._check_pending()
-        check_alike([getattr(self.splat, name) for name in PARAMETERS])
+        """Write ``point_cloud.ply``."""
         if self.trainer.is_global_zero:
-            self.export(self.folder / "point_cloud.ply")
+            self.export(Path(self.trainer.default_root_dir) / "point_cloud.ply")
 
     def export(self, path: str | os.PathLike[str]) -> None:
         """Write the Gaussians as a 3DGS file, without those that are not finite.
@@ -479,5 +457,7 @@ class SplatTrainer(lightning.LightningModule):
             ValueError: If none is finite.
         """
         Path(path).parent.mkdir(parents=True, exist_ok=True)
-        finite = finite_cloud(self.splat.to_cloud())
+        cloud = self.splat.to_cloud()
+        values = (cloud.means, cloud.quats, cloud.scales, cloud.opacities[:, None], cloud.sh.flatten(1))
+        finite = cloud.select(torch.cat(values, dim=1).isfinite().all(-1))
         GaussianSurfaceModel.from_cloud(finite, requires_grad=False).save_ply(path)

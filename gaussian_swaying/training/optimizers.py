@@ -14,9 +14,6 @@ from gaussian_swaying._checks import check_positive
 from gaussian_swaying.training.densification import PARAMETERS
 from gaussian_swaying.training.parallel import scaled_adam
 
-OPTIMIZERS = ("adam", "selective_adam")
-"""Kinds of :class:`GaussianAdam`."""
-
 
 class GaussianAdam(torch.optim.Adam):
     """One Adam for all parameters of the Gaussians, in groups in the order of :data:`PARAMETERS`.
@@ -24,27 +21,16 @@ class GaussianAdam(torch.optim.Adam):
     Args:
         parameters: The parameters, shape (N, ...) each.
         rates: Their learning rates.
-        kind: ``adam``, or ``selective_adam``: gsplat's Adam of the Gaussians in the picture alone (Mallick et al. 2024,
-            "Taming 3DGS"); CUDA only. It does not correct the bias of the first steps.
         devices: Number of devices that train together, see
             :func:`~gaussian_swaying.training.parallel.scaled_adam`.
-
-    Raises:
-        ValueError: If ``kind`` does not run on the device of the parameters.
     """
 
-    def __init__(
-        self, parameters: Sequence[Tensor], rates: Sequence[float], kind: str = "adam", devices: int = 1
-    ) -> None:
-        device = parameters[0].device
-        if kind != "adam" and device.type != "cuda":
-            raise ValueError(f"`optimizer` {kind} needs CUDA, but the Gaussians are on {device}: use adam there.")
-        self.selective = kind != "adam"
+    def __init__(self, parameters: Sequence[Tensor], rates: Sequence[float], devices: int = 1) -> None:
         groups = [{"params": [p]} | scaled_adam(rate, devices) for p, rate in zip(parameters, rates, strict=True)]
-        super().__init__(groups, fused=device.type == "cuda" and not self.selective)
+        super().__init__(groups, fused=parameters[0].device.type == "cuda")
 
     @torch.no_grad()
-    def step(self, closure: Callable[[], Any] | None = None, seen: Tensor | None = None) -> Any:
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:
         """Step every parameter that has a gradient.
 
         From the second step on, torch's fused kernel is called as ``Adam.step`` would; all else that it does takes the
@@ -52,7 +38,6 @@ class GaussianAdam(torch.optim.Adam):
 
         Args:
             closure: Called first, as Lightning wants it.
-            seen: Which Gaussians were in the picture, bool (N,), for ``selective_adam``.
 
         Returns:
             The result of ``closure``.
@@ -62,32 +47,28 @@ class GaussianAdam(torch.optim.Adam):
             with torch.enable_grad():
                 result = closure()
         groups = [group for group in self.param_groups if group["params"][0].grad is not None]
-        if self.selective:
-            from gsplat import SelectiveAdam
-
-            SelectiveAdam.step(self, seen)
-        elif not groups or not all(group["fused"] and self.state.get(group["params"][0]) for group in groups):
+        if not groups or not all(group["fused"] and self.state.get(group["params"][0]) for group in groups):
             super().step()
-        else:
-            states = [self.state[group["params"][0]] for group in groups]
-            torch._foreach_add_([state["step"] for state in states], 1.0)
-            for group, state in zip(groups, states, strict=True):
-                beta1, beta2 = group["betas"]
-                torch._fused_adam_(
-                    group["params"],
-                    [group["params"][0].grad],
-                    [state["exp_avg"]],
-                    [state["exp_avg_sq"]],
-                    [],
-                    [state["step"]],
-                    lr=group["lr"],
-                    beta1=beta1,
-                    beta2=beta2,
-                    weight_decay=group["weight_decay"],
-                    eps=group["eps"],
-                    amsgrad=False,
-                    maximize=group["maximize"],
-                )
+            return result
+        states = [self.state[group["params"][0]] for group in groups]
+        torch._foreach_add_([state["step"] for state in states], 1.0)
+        for group, state in zip(groups, states, strict=True):
+            beta1, beta2 = group["betas"]
+            torch._fused_adam_(
+                group["params"],
+                [group["params"][0].grad],
+                [state["exp_avg"]],
+                [state["exp_avg_sq"]],
+                [],
+                [state["step"]],
+                lr=group["lr"],
+                beta1=beta1,
+                beta2=beta2,
+                weight_decay=group["weight_decay"],
+                eps=group["eps"],
+                amsgrad=False,
+                maximize=group["maximize"],
+            )
         return result
 
 

@@ -1,11 +1,13 @@
 """Sweeps of tiny flags: as a file, done once without disturbance, and with workers that are killed."""
 
 import multiprocessing
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
 import yaml
+from loky import ProcessPoolExecutor
 from shared import SMALL
 
 from gaussian_swaying.cli.sweep import main
@@ -44,7 +46,7 @@ def _workers():
         ["gaussian_swaying.cli.sweep", "gaussian_swaying.simulation.simulation", "torch._dynamo"]
     )
     with pytest.MonkeyPatch.context() as changes:
-        changes.setattr(run, "get_context", lambda method: server)
+        changes.setattr(run, "ProcessPoolExecutor", partial(ProcessPoolExecutor, context=server))
         yield
 
 
@@ -58,15 +60,17 @@ def kill(monkeypatch):
     """Lets so many jobs be the last of their workers, which are killed when they have got them."""
 
     def begin(jobs):
-        submit, left = run.Pool.submit, list(range(jobs))
+        submit, left = run.Processes.submit, list(range(jobs))
 
         def submitting(self, job):
-            submit(self, job)
+            future = submit(self, job)
             if left:
                 left.pop()
-                next(worker for worker in self._workers if worker.job is job).process.kill()
+                (process,) = self._executors[self._places[future]]._processes.values()
+                process.kill()
+            return future
 
-        monkeypatch.setattr(run.Pool, "submit", submitting)
+        monkeypatch.setattr(run.Processes, "submit", submitting)
 
     return begin
 

@@ -12,7 +12,8 @@ from shared import rows
 from gaussian_swaying.cli.sweep import main
 from gaussian_swaying.sweeps import record
 from gaussian_swaying.sweeps.dataset import SweepDataset, write_shards
-from gaussian_swaying.sweeps.record import write_parquet
+from gaussian_swaying.sweeps.plan import Plan
+from gaussian_swaying.sweeps.record import write_tables
 
 
 def test_parquet(tmp_path):
@@ -21,7 +22,7 @@ def test_parquet(tmp_path):
     figures = {name: None for name in record.SUMMARY} | {"frames": 5, "substeps": 7.0, "warnings": 0}
     results = {"00000": {"status": "complete", "reason": None, "figures": figures}}
     results["00001"] = {"status": "failed", "reason": "It broke."}
-    write_parquet(tmp_path, ["00000", "00001", "00002"], runs, results)
+    write_tables(tmp_path, Plan("", 5, tuple(runs), {}), results, parquet=True)
     table = parquet.read_table(tmp_path / "sweep.parquet").to_pydict()
     assert table["run"] == ["00000", "00001", "00002"]
     assert table["status"] == ["complete", "failed", "missing"]
@@ -46,6 +47,7 @@ def test_the_parquet_of_a_sweep(undisturbed, tmp_path, sweep_file):
 
 
 def test_shards(undisturbed, tmp_path):
+    webdataset = pytest.importorskip("webdataset")
     files = write_shards(undisturbed, 3, tmp_path / "shards", positions=True)
     assert [file.name for file in files] == ["000000.tar", "000001.tar", "000002.tar"]
     data, seen = SweepDataset(undisturbed, positions=True), []
@@ -73,7 +75,6 @@ def test_shards(undisturbed, tmp_path):
     assert [a.read_bytes() for a in files] == [b.read_bytes() for b in again]
     (larger,) = write_shards(undisturbed, 100, tmp_path / "shards", frames=False)
     assert [file.name for file in (tmp_path / "shards").iterdir()] == [larger.name]
-    webdataset = pytest.importorskip("webdataset")
     read = webdataset.WebDataset(str(tmp_path / "again/{000000..000002}.tar"), shardshuffle=False).decode("rgb8")
     samples = list(read)
     assert [sample["__key__"] for sample in samples] == data.runs
@@ -83,6 +84,7 @@ def test_shards(undisturbed, tmp_path):
 
 
 def test_the_shards_of_a_sweep(undisturbed, tmp_path, sweep_file, capsys):
+    pytest.importorskip("webdataset")
     file = sweep_file(tmp_path / "tiny.yaml")
     assert main([str(file), "--output", str(undisturbed), "--resume", "--shards", "8"]) == 0
     assert f"wrote {undisturbed / 'shards'}" in capsys.readouterr().out

@@ -1,5 +1,6 @@
 """Runs that are simulated together on a GPU, and sweeps on one and several GPUs."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -10,7 +11,6 @@ import torch
 from shared import advanced, peak, rows
 
 from gaussian_swaying.cli.sweep import main
-from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.plan import make_plan, read_sweep
 from gaussian_swaying.sweeps.run import Job, members_of
 
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.gpu
 def _batch(tmp_path, file):
     plan = make_plan(read_sweep(file))
     job = Job(tmp_path, tuple(plan.names), plan.config, plan.frames, tuple(plan.runs), "cuda")
-    members, _ = members_of(job, Simulation.parser())
+    members = members_of(job)
     return members[0].batch([member.model for member in members]), members
 
 
@@ -61,9 +61,10 @@ def test_a_sweep_on_all_gpus(tmp_path, sweep_file):
     file, folder = sweep_file(tmp_path / "tiny.yaml", settings=settings), tmp_path / "out"
     assert main([str(file), "--output", str(folder), "--together", "4", "--device", "cuda"]) == 0
     assert {row["status"] for row in rows(folder / "sweep.csv")} == {"complete"}
-    assert all(int(row["device_bytes"]) > 0 for row in rows(folder / "times.csv"))
+    for file in (folder / "results").iterdir():
+        assert json.loads(file.read_text())["peak_memory_bytes"]["device"] > 0
     again = tmp_path / "again"
-    assert main([str(file), "--output", str(again), "--together", "4", "--device", "cuda", "--per-gpu", "auto"]) == 0
+    assert main([str(file), "--output", str(again), "--together", "4", "--device", "cuda", "--per-gpu", "2"]) == 0
     assert (again / "sweep.csv").read_bytes() == (folder / "sweep.csv").read_bytes()
 
 
@@ -77,5 +78,5 @@ def test_training_on_two_gpus(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, done.stderr[-2000:]
     assert len(list((tmp_path / "two").rglob("*.ply"))) == 1
-    log = [row for row in rows(tmp_path / "two/csv/metrics.csv") if row.get("val/psnr")]
+    log = [row for row in rows(tmp_path / "two/csv/version_0/metrics.csv") if row.get("val/psnr")]
     assert float(log[-1]["val/psnr"]) > 18

@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[2]
 def test_a_plan(tmp_path, sweep_file, parser):
     plan = make_plan(read_sweep(sweep_file(tmp_path / "a.yaml")), parser)
     assert plan.names == [f"{number:05d}" for number in range(8)]
-    assert plan.axes == ["wind.flow", "material.E", "wind.seed"]
+    assert list(plan.runs[0]) == ["wind.flow", "material.E", "wind.seed"]
     assert plan.frames == 12
     assert plan.splats == {}
     settings = parse_run(parser, plan.config, plan.frames, plan.runs[7])

@@ -2,12 +2,13 @@
 
 import errno
 import json
-import multiprocessing
 import os
 import signal
+from concurrent.futures import Future
 
 import numpy as np
 import pytest
+from loky import ProcessPoolExecutor
 from PIL import Image
 from shared import refused, rows
 
@@ -16,13 +17,17 @@ from gaussian_swaying.runs.lock import LOCK, FolderLock
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps import run
 from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep
-from gaussian_swaying.sweeps.run import Job, do
+from gaussian_swaying.sweeps.run import Job, Outcome, drive, work
 
 QUICK = ["--workers", "2", "--device", "cpu"]
 
 
 def _done(folder):
     return {file: file.stat().st_mtime_ns for file in (folder / "results").glob("[0-9]*.json")}
+
+
+def _attempts(folder):
+    return [json.loads(file.read_text())["attempts"] for file in sorted((folder / "results").iterdir())]
 
 
 def _same_motion(one, two, name):
@@ -49,9 +54,8 @@ def test_a_sweep(undisturbed):
         assert int(row["frames"]) == 12
         assert (undisturbed / "runs" / row["run"] / "video.mp4").exists()
     assert not [name for name in table[0] if "wall" in name or "time" in name]
-    times = rows(undisturbed / "times.csv")
-    assert {row["attempts"] for row in times} == {"1"}
-    assert all(float(row["simulation_s"]) > 0 for row in times)
+    assert _attempts(undisturbed) == [1] * 8
+    assert json.loads((undisturbed / "results/00003.json").read_text())["wall_s"]["simulation"] > 0
     assert not (undisturbed / LOCK).exists()
 
 
@@ -86,7 +90,7 @@ def test_a_complete_sweep_is_left_alone(undisturbed, tmp_path, sweep_file, capsy
 def test_killed_workers_change_nothing(undisturbed, tmp_path, sweep_file, kill):
     kill(3)
     assert main([str(sweep_file(tmp_path / "tiny.yaml")), "--output", str(tmp_path / "out"), *QUICK]) == 0
-    assert sum(int(row["attempts"]) for row in rows(tmp_path / "out/times.csv")) == 11
+    assert sum(_attempts(tmp_path / "out")) == 11
     assert (tmp_path / "out/sweep.csv").read_bytes() == (undisturbed / "sweep.csv").read_bytes()
     for number in range(8):
         _same_motion(undisturbed, tmp_path / "out", f"{number:05d}")
@@ -99,7 +103,7 @@ def test_a_run_goes_on_where_its_worker_was_killed(undisturbed, tmp_path, sweep_
     begun = Simulation.from_settings(parser, parse_run(parser, plan.config, 5, plan.runs[5]))
     begun.run(tmp_path / "runs/00005", 5, progress=False)
     job = Job(tmp_path, ("00005",), plan.config, plan.frames, (plan.runs[5],), "cpu", attempt=2)
-    result = do(job, parser, explain).results["00005"]
+    result = work(job, 1, explain).results["00005"]
     assert (result["status"], result["attempts"], result["figures"]["frames"]) == ("complete", 2, 12)
     _same_motion(undisturbed, tmp_path, "00005")
     assert [path.name for path in (tmp_path / "runs").iterdir()] == ["00005"]  # no earlier run was moved aside
@@ -107,14 +111,15 @@ def test_a_run_goes_on_where_its_worker_was_killed(undisturbed, tmp_path, sweep_
 
 @pytest.mark.usefixtures("default_signals")
 def test_a_stopped_sweep_ends_in_order(undisturbed, tmp_path, sweep_file, monkeypatch, capsys):
-    file, folder, ended = sweep_file(tmp_path / "tiny.yaml"), tmp_path / "out", run._Keeper.ended
+    file, folder, outcome = sweep_file(tmp_path / "tiny.yaml"), tmp_path / "out", run.Processes.outcome
 
-    def stop(self, name, result):
-        ended(self, name, result)
+    def stop(self, job, future):
+        found = outcome(self, job, future)
         os.kill(os.getpid(), signal.SIGTERM)
+        return found
 
     with monkeypatch.context() as patch:
-        patch.setattr(run._Keeper, "ended", stop)
+        patch.setattr(run.Processes, "outcome", stop)
         assert main([str(file), "--output", str(folder), *QUICK]) == 143
     error = capsys.readouterr().err
     assert "Stopped; complete runs are kept" in error
@@ -132,18 +137,19 @@ def test_a_stopped_sweep_ends_in_order(undisturbed, tmp_path, sweep_file, monkey
 
 def test_ctrl_c_of_the_terminal_is_for_the_driver_alone(tmp_path, sweep_file, monkeypatch):
     """Workers do not hear it, not even while they import."""
-    hire = run.Pool._hire
+    submit = run.Processes.submit
 
-    def disturbed(self):
-        found = hire(self)
-        os.kill(found.process.pid, signal.SIGINT)
-        return found
+    def disturbed(self, job):
+        future = submit(self, job)
+        (process,) = self._executors[self._places[future]]._processes.values()
+        os.kill(process.pid, signal.SIGINT)
+        return future
 
-    monkeypatch.setattr(run, "get_context", multiprocessing.get_context)  # by spawn, as outside the tests
-    monkeypatch.setattr(run.Pool, "_hire", disturbed)
+    monkeypatch.setattr(run, "ProcessPoolExecutor", ProcessPoolExecutor)  # as outside the tests
+    monkeypatch.setattr(run.Processes, "submit", disturbed)
     file = sweep_file(tmp_path / "one.yaml", {"wind.seed": [1]}, 1, {"frames": 2})
     assert main([str(file), "--output", str(tmp_path / "out"), *QUICK]) == 0
-    assert [row["attempts"] for row in rows(tmp_path / "out/times.csv")] == ["1"]
+    assert _attempts(tmp_path / "out") == [1]
 
 
 # ---- failures
@@ -161,7 +167,7 @@ def test_failed_runs_are_recorded_and_stop_nothing(tmp_path, sweep_file, capsys)
     assert [row["status"] for row in table] == ["complete", "failed", "diverged", "failed"]
     assert "`material.nu`" in table[1]["reason"]
     assert "wind" in table[2]["reason"]
-    assert [row["attempts"] for row in rows(folder / "times.csv")] == ["1", "2", "2", "2"]
+    assert _attempts(folder) == [1, 2, 2, 2]
     assert (folder / "contact_sheet.png").exists()
     before = _done(folder)
     assert main([str(file), "--output", str(folder), *QUICK, "--resume"]) == 2
@@ -180,12 +186,12 @@ def test_failed_runs_are_recorded_and_stop_nothing(tmp_path, sweep_file, capsys)
     ],
 )
 def test_what_failed_is_told_in_one_sentence(tmp_path, monkeypatch, error, words):
-    def fail(job, parser):
+    def fail(job):
         raise error
 
-    monkeypatch.setattr(run, "_run", fail)
+    monkeypatch.setattr(run, "run_alone", fail)
     (tmp_path / "logs").mkdir()
-    done = do(Job(tmp_path, ("00000",), "", 2, ({},), attempt=2), None, explain)
+    done = work(Job(tmp_path, ("00000",), "", 2, ({},), attempt=2), 1, explain)
     result = done.results["00000"]
     assert (result["status"], result["attempts"], done.ready) == ("failed", 2, False)
     for word in words:
@@ -204,6 +210,57 @@ def test_a_run_whose_process_is_killed_too_often_is_recorded(tmp_path, sweep_fil
     assert "SIGKILL" in bad["reason"]
     assert "--workers" in bad["reason"]
     assert main([str(file), "--output", str(folder), *QUICK, "--resume"]) == 0
+
+
+class _Scripted:
+    """A pool that ends jobs as it is told."""
+
+    workers = 1
+
+    def __init__(self, ends):
+        self.ends, self.given, self.closed = list(ends), [], False
+
+    def submit(self, job):
+        self.given.append(job)
+        future = Future()
+        future.set_result(None)
+        return future
+
+    def outcome(self, job, future):
+        status, killed = self.ends.pop(0)
+        return Outcome({name: {"status": status} for name in job.wanted}, killed)
+
+    def stop(self):
+        raise AssertionError("never called")
+
+    def close(self):
+        self.closed = True
+
+
+def _drive(job, ends, retries=1):
+    pool, found = _Scripted(ends), {}
+    drive([job], pool, lambda name, result: found.update({name: result["status"]}), retries)
+    assert pool.closed
+    assert pool.ends == []
+    return pool, found
+
+
+def test_what_is_tried_again(tmp_path):
+    one = Job(tmp_path, ("00000",), "", 2, ({},))
+    bad, killed, good = ("failed", False), ("failed", True), ("complete", False)
+    pool, found = _drive(one, [bad, good])
+    assert found == {"00000": "complete"}
+    assert [job.attempt for job in pool.given] == [1, 2]
+    assert _drive(one, [bad, bad])[1] == {"00000": "failed"}
+    assert _drive(one, [killed] * 3 + [good])[1] == {"00000": "complete"}
+    assert _drive(one, [killed] * 4)[1] == {"00000": "failed"}
+    many = Job(tmp_path, ("00000", "00001", "00002"), "", 2, ({}, {}, {}), complete=frozenset({"00001"}))
+    pool, found = _drive(many, [bad, good, bad, good])
+    assert found == {"00000": "complete", "00002": "complete"}
+    assert [job.names for job in pool.given] == [many.names, ("00000",), ("00002",), ("00002",)]
+    pool, found = _drive(many, [killed, good])
+    assert [job.names for job in pool.given] == [many.names] * 2
+    assert found == {"00000": "complete", "00002": "complete"}
 
 
 # ---- refused

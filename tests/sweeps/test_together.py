@@ -9,10 +9,9 @@ from shared import rows
 
 from gaussian_swaying.cli.sweep import main
 from gaussian_swaying.config.parser import config_text
-from gaussian_swaying.simulation.model import in_settings
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep
-from gaussian_swaying.sweeps.run import Job, grouped, members_of, texts
+from gaussian_swaying.sweeps.run import Job, grouped, members_of
 
 FIXED = {"solver.substep": 2e-3, "frames": 5}
 OPTIONS = ("--workers", "2", "--device", "cpu")
@@ -60,7 +59,7 @@ def test_together_as_alone(tmp_path, sweep_file):
 def test_the_state_of_a_scene(tmp_path, sweep_file):
     plan = make_plan(read_sweep(sweep_file(tmp_path / "tiny.yaml", settings=FIXED)))
     job = Job(tmp_path, tuple(plan.names), plan.config, plan.frames, tuple(plan.runs), "cpu")
-    members = members_of(job, Simulation.parser())[0]
+    members = members_of(job)
     together = members[0].batch([member.model for member in members])
     state = together.start()
     assert state.position.shape[0] == 8
@@ -75,30 +74,18 @@ def test_the_state_of_a_scene(tmp_path, sweep_file):
     assert frame.each[3].displacement_max == pytest.approx(float(moved.amax()))
 
 
-def test_the_configurations_of_a_group_are_those_that_the_parser_writes(tmp_path, sweep_file, monkeypatch):
-    """The parser writes one of them, unless its YAML is not what PyYAML makes of it."""
+def test_the_configurations_of_a_group_are_those_that_the_parser_writes(tmp_path, sweep_file):
     axes = {"wind.flow": [[3.0, 1.0, 0.0], [6, 1.5, -0.25]], "material.E": [3e3, 1e-2], "material.nu": [0.3, 0.0]}
     axes |= {"wind.seed": [1, 7], "material.density": [20, 30.5]}
     plan = make_plan(read_sweep(sweep_file(tmp_path / "tiny.yaml", axes=axes, draws=1)))
-    parser, calls = Simulation.parser(), []
-    settings = [parse_run(parser, plan.config, plan.frames, plan.runs[0])]
-    for run in plan.runs[6::6]:
-        settings.append(settings[0].clone())
-        for name, value in run.items():
-            in_settings(settings[-1], {name: value})
+    runs, parser = (plan.runs[0], *plan.runs[6::6]), Simulation.parser()
+    members = members_of(Job(tmp_path, ("",) * len(runs), plan.config, plan.frames, runs, "cpu"))
+    settings = [parse_run(parser, plan.config, plan.frames, run) for run in runs]
+    for one in settings:
+        one.device = "cpu"
     expected = [config_text(parser, one) for one in settings]
     assert len(set(expected)) == 6
-
-    def counted(*given):
-        calls.append(given)
-        return config_text(*given) + more
-
-    monkeypatch.setattr("gaussian_swaying.sweeps.run.config_text", counted)
-    more = ""
-    assert texts(parser, settings, list(axes)) == expected
-    assert len(calls) == 1
-    more = "# a comment\n"
-    assert texts(parser, settings, list(axes)) == [text + more for text in expected]
+    assert [member.config for member in members] == expected
 
 
 def test_a_diverged_run_is_done_alone(tmp_path, sweep_file, capsys):

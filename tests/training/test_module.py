@@ -15,10 +15,9 @@ from gaussian_swaying.training.densification import (
     DefaultDensification,
     MCMCDensification,
 )
-from gaussian_swaying.training.finite import TrainingDiverged
 from gaussian_swaying.training.initial import gaussians_from_points
 from gaussian_swaying.training.losses import LossTerm, MeanOpacityLoss, MeanScaleLoss
-from gaussian_swaying.training.module import SplatTrainer
+from gaussian_swaying.training.module import SplatTrainer, TrainingDiverged
 from gaussian_swaying.training.optimizers import LearningRates, means_rate
 
 

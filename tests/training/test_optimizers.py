@@ -1,10 +1,7 @@
 """The optimiser of the Gaussians."""
 
-import pytest
 import torch
-from shared import value_error
 
-from gaussian_swaying.rendering.protocol import ScreenGaussians
 from gaussian_swaying.training.optimizers import GaussianAdam
 from gaussian_swaying.training.parallel import scaled_adam
 
@@ -48,27 +45,3 @@ def test_one_adam_is_six():
     optimizer.zero_grad()
     optimizer.step()  # nothing to do
     assert torch.equal(parameters[0], alone[0])
-
-
-def test_the_selective_one_needs_a_gpu():
-    with value_error("`optimizer` selective_adam needs CUDA"):
-        GaussianAdam([torch.ones(3)], [0.1], "selective_adam")
-
-
-@pytest.mark.gpu
-def test_the_selective_one_moves_what_was_seen():
-    parameter = torch.nn.Parameter(torch.ones(4, 3, device="cuda"))
-    optimizer = GaussianAdam([parameter], [0.1], "selective_adam")
-    parameter.grad = torch.ones_like(parameter)
-    optimizer.step(seen=torch.tensor([True, False, True, False], device="cuda"))
-    assert (parameter[[1, 3]] == 1).all()
-    assert (parameter[[0, 2]] < 1).all()
-
-
-def test_which_gaussians_a_picture_shows():
-    """From all of them, and from a list of those that were drawn."""
-    radii = torch.tensor([[2, 3], [0, 1], [4, 1]])
-    everything = ScreenGaussians(torch.zeros(1, 3, 2), radii[None], None, 8, 8)
-    assert everything.seen(3).tolist() == [True, False, True]
-    listed = ScreenGaussians(torch.zeros(3, 2), radii, torch.tensor([4, 0, 2]), 8, 8)
-    assert listed.seen(5).tolist() == [False, False, True, False, True]

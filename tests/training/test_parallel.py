@@ -17,9 +17,8 @@ from torch.utils.data import DataLoader
 from gaussian_swaying.gaussians.ply import read_ply
 from gaussian_swaying.training.data.datamodule import EndlessShuffle
 from gaussian_swaying.training.densification import PARAMETERS, DefaultDensification
-from gaussian_swaying.training.module import SplatTrainer
-from gaussian_swaying.training.parallel import check_alike, scaled_adam, seen_by_any, share_gradients, steps_of
-from gaussian_swaying.training.strategy import SplatParallel
+from gaussian_swaying.training.module import SplatParallel, SplatTrainer
+from gaussian_swaying.training.parallel import scaled_adam, share_gradients, steps_of
 
 TOOL = Path(__file__).parents[2] / "tools/train.py"
 
@@ -61,16 +60,7 @@ def _share(rank, address, out):
         first, second = torch.nn.Parameter(torch.ones(3)), torch.nn.Parameter(torch.ones(2))
         first.grad = torch.tensor([1.0, 2.0, 3.0]) * (rank + 1)
         mean = share_gradients([first, second], torch.tensor(rank + 1.0))
-        check_alike([first, second])
-        told = "no"
-        with torch.no_grad():
-            first[rank] = 7.0
-        try:
-            check_alike([first, second])
-        except RuntimeError as error:
-            told = str(error)
-        seen = seen_by_any(torch.tensor([rank == 0, rank == 1, False]))
-        held = {"mean": mean, "first": first.grad, "second": second.grad, "told": told, "seen": seen}
+        held = {"mean": mean, "first": first.grad, "second": second.grad}
         torch.save(held, f"{out}/{rank}.pt")
     finally:
         distributed.destroy_process_group()
@@ -83,8 +73,6 @@ def test_gradients_are_averaged(tmp_path):
         assert held["mean"] == 1.5
         assert held["first"].tolist() == [1.5, 3.0, 4.5]
         assert held["second"].tolist() == [0.0, 0.0]
-        assert "no longer hold the same" in held["told"]
-        assert held["seen"].tolist() == [True, True, False]
 
 
 class _Views(lightning.LightningDataModule):
@@ -154,7 +142,7 @@ def test_two_processes_make_one_splat(tmp_path):
         done = _train(tmp_path / f"of{devices}", capture, "--trainer.devices", str(devices))
         assert done.returncode == 0, done.stderr[-2000:]
         assert done.stdout.count("point_cloud.ply\n") == 1  # one process tells it
-        log = [row for row in rows(tmp_path / f"of{devices}/csv/metrics.csv") if row.get("val/psnr")]
+        log = [row for row in rows(tmp_path / f"of{devices}/csv/version_0/metrics.csv") if row.get("val/psnr")]
         psnr.append(float(log[-1]["val/psnr"]))
         (ply,) = (tmp_path / f"of{devices}").rglob("*.ply")
         counts.append(len(read_ply(ply).means))

@@ -181,7 +181,6 @@ class CaptureDataModule(LightningDataModule):
         self.seed = int(os.environ.get("PL_GLOBAL_SEED", "0")) if seed is None else seed
         self._capture: Capture | None = None
         self._datasets: dict[str, CaptureDataset] = {}
-        self._seen = 0  # training images of the run that this one resumes
 
     @property
     def capture(self) -> Capture:
@@ -264,29 +263,23 @@ class CaptureDataModule(LightningDataModule):
         """Training images, shuffled and endless."""
         dataset = self._dataset("train")
         rank, devices = this_device()
-        order = EndlessShuffle(len(dataset), self.seed, self._seen + rank, devices)
+        seen = 0 if self.trainer is None else self.trainer.global_step * devices
+        order = EndlessShuffle(len(dataset), self.seed, seen + rank, devices)
         return DataLoader(dataset, sampler=order, **self._options())
 
     def state_dict(self) -> dict[str, int]:
-        """Number of training images seen, and what defines their order; Lightning stores it in checkpoints."""
-        seen = self._seen if self.trainer is None else self.trainer.global_step * this_device()[1]
-        return {"seed": self.seed, "count": len(self.capture.split("train")), "seen": seen}
+        """The settings that define the order of training images; Lightning stores them in checkpoints."""
+        return {"seed": self.seed, "count": len(self.capture.split("train"))}
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
-        """Continue with the next training image.
-
-        Raises:
-            ValueError: If the seed or the number of training images has changed.
-        """
-        now = {"seed": self.seed, "count": len(self.capture.split("train"))}
-        fitting = self.trainer is None or self.trainer.state.fn == "fit"
+        """Refuse a checkpoint of another seed or number of training images."""
+        now, fitting = self.state_dict(), self.trainer is None or self.trainer.state.fn == "fit"
         for name, what in (("seed", "seed"), ("count", "number of training images")):
             if fitting and state_dict[name] != now[name]:
                 raise ValueError(
                     f"The {what} of {self.path} was {state_dict[name]} in the checkpoint and is {now[name]} now: set "
                     "the old value, or start a new run."
                 )
-        self._seen = int(state_dict["seen"])
 
     def other_view(self, index: int, pick: float) -> TrainingImage | None:
         """A training image that shows the same place as another one, for losses that compare two views.

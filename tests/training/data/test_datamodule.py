@@ -126,11 +126,9 @@ def test_a_resumed_run_sees_the_images_that_come_next(folder, tmp_path, stop):
 
 
 def test_a_checkpoint_of_other_images_or_another_seed_is_refused(folder):
-    state = {"seed": 0, "count": 7, "seen": 5}
+    state = {"seed": 0, "count": 7}
     data = CaptureDataModule(folder)
-    data.load_state_dict(state)
-    order = _indices(CaptureDataModule(folder), 9)
-    assert _indices(data, 4) == order[5:]
+    data.load_state_dict(state | {"seen": 5})  # of an earlier version
     assert data.state_dict() == state
     with value_error(r"seed.*was 0.*is 4 now"):
         CaptureDataModule(folder, seed=4).load_state_dict(state)
