@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 from collections.abc import Sequence
@@ -60,7 +61,7 @@ def write_camera(options: argparse.Namespace) -> int:
         raise ValueError(f"Expected `--fov` to be between 0 and 180 degrees, but got {options.fov:g}.")
     film = check_regular(Path(options.film), "the film")
     still = film.suffix.lower() in registration.STILLS
-    frame = read_image(film)[..., :3].contiguous() if still else open_film(film, None).first_frame()
+    frame = read_image(film)[..., :3].contiguous() if still else open_film(film, math.inf).first_frame()
     cloud = read_gaussians(options.splat, 0)
     draw, (height, width) = registration.painter_of(cloud), frame.shape[:2]
     start = registration.first_cameras(cloud, options.up, options.fov or registration.VIEW, width, height)

@@ -88,15 +88,15 @@ class Film:
             return torch.frombuffer(bytearray(frame), dtype=torch.uint8).reshape(*head["size"][::-1], 3)
 
 
-def open_film(path: str | Path, side: int | None = SIDE) -> Film:
-    """Read the head of a film; ``side`` is the longer side of its frames at most [pixels]."""
+def open_film(path: str | Path, side: float | None = None) -> Film:
+    """Read the head of a film; ``side`` is the longer side of its frames at most [pixels], :data:`SIDE` if left out."""
     file = check_regular(Path(path), "the film")
     with closing(frames_of(file)) as frames:
         head = next_of(frames, file)
         if head is None or next_of(frames, file) is None:
             raise ValueError(f"The film {file} has no frames: convert it to mp4.")
     width, height = head["size"]
-    factor = max(1.0, max(width, height) / (side or math.inf))
+    factor = max(1.0, max(width, height) / (side or SIDE))
     if not head["fps"] > 0:
         raise ValueError(f"The film {file} does not say its frame rate: convert it to mp4.")
     size = check_wide(file, round(width / factor), round(height / factor))

@@ -115,8 +115,8 @@ SPREAD = ("wind.speed", "wind.azimuth")
 APART, SAME = 0.15, 0.03
 """Least distance between starts, and largest between ends that are the same, as a share of a range."""
 
-BRIEF, REFINED = 4, 5
-"""Most steps of a short solve at a horizon, and on another grid."""
+BRIEF, REFINED, TRIES = 4, 5, 2
+"""Most iterations of a short solve at a horizon, and on another grid; and steps that are tried for each."""
 
 RIVAL, MIRRORED = 1.05, 1.25
 """Cost per that of the best end below which another end may be right as well, and that of the mirrored wind, which
@@ -360,8 +360,8 @@ class Problem:
     ) -> Solved:
         """Where the steps from a place end."""
         at = torch.tensor(place, dtype=torch.float64)
-        with self.say.work(f"to {times[-1]:.3g} s", most * len(times) * (1 + 2 * len(at))):
-            return solve(self.residuals(evidence, times), _scaled(evidence), at, most, closely)
+        with self.say.work(f"to {times[-1]:.3g} s", most * len(times) * (TRIES + 2 * len(at))):
+            return solve(self.residuals(evidence, times), _scaled(evidence), at, TRIES * most, closely)
 
     # ---- the steps
 
@@ -589,9 +589,10 @@ class Problem:
             evidence = self.evidence(stage, course.matched)
             if share >= HORIZONS[-1]:
                 evidence = self.trusted(evidence, course.matched)
-            if course.ended or course.tried >= self.plan.iterations:  # it is continued after its end
+            left = self.plan.iterations - course.tried // TRIES
+            if course.ended or left <= 0:  # it is continued after its end
                 return evidence
-            found = self.solved(course.place, evidence, times, self.plan.iterations - course.tried, last)
+            found = self.solved(course.place, evidence, times, left, last)
             course.place = found.place.tolist()
             row = {"stage": stage, "horizon_s": times[-1], "steps": found.steps, "cost": found.cost}
             row |= {"ended": found.ended} | {f"scale_{k}": v for k, v in found.scales.items()}
@@ -800,7 +801,7 @@ def _ready(plan: Plan, parser: Any, settings: Any, device: str, progress: bool) 
     simulation, say = Simulation.from_settings(parser, own), Say(progress)
     videos = read_videos(list(plan.videos), plan.cameras, simulation.scene.size, simulation.scene.model.origin)
     looked = _looked(simulation, videos, plan) if find_spec("cv2") else []
-    with say.work("the camera and the light of each frame", sum(len(video.times) for video in videos)):
+    with say.work("the camera of each frame", sum(len(video.times) for video in videos)):
         videos, judged = prepared(simulation, videos, plan.hand_held, plan.also_moves, say, say.tick)
 
     def on_grid(ratio: float) -> Simulation:

@@ -42,7 +42,7 @@ class Plan:
         until: Fit the frames up to this time [s] instead of a share of them.
         search: Number of simulations of the coarse search; 0 starts at ``start`` or in the middle of the ranges.
         starts: Number of starts that the search gives to short solves, of which the best goes on.
-        iterations: Most steps that a stage tries at each horizon.
+        iterations: Most iterations of a stage at each horizon.
         tracks: Most tracks of a camera.
         limit: Largest condition number of the sensitivities; above it the fit is refused.
         seed: Seed of the coarse search.

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from handheld_films import photographed
 from small_films import changed
 
 from gaussian_swaying.inverse.evidence import TrackEvidence
@@ -92,10 +91,17 @@ def _printed(folder, spacing):
     return changed(folder, scene={"generator": {"class_path": "FlagScene", "init_args": flag}})
 
 
-def _photographed(camera):
-    """A picture of the printed sheet itself, uint8, (H, W, 3)."""
-    sheet = (0.4, 0.3, 0.0, (0.0, 0.0, 0.0))
-    return (255 * photographed(camera, [sheet], 3, printed_colours)).round().to(torch.uint8)
+def _photographed(camera, finer=3):
+    """A picture of the printed sheet itself, by rays and not as Gaussians, uint8, (H, W, 3)."""
+    rows, columns = ((torch.arange(n * finer) + 0.5).double() / finer for n in (camera.height, camera.width))
+    row, column = torch.meshgrid(rows, columns, indexing="ij")
+    local = torch.stack([column, row, torch.ones_like(row)], -1) @ camera.intrinsics.double().inverse().T
+    ray, eye = local @ camera.world_to_camera[:3, :3].double(), camera.position.double()
+    place = eye - (eye[1] / ray[..., 1])[..., None] * ray
+    x, _, z = place.unbind(-1)
+    seen, colour = (x > 0) & (x < 0.4) & (z > 0) & (z < 0.3), torch.zeros_like(ray)
+    colour[seen] = printed_colours(x[seen], z[seen]).double()
+    return (255 * colour.unflatten(0, (-1, finer)).unflatten(2, (-1, finer)).mean((1, 3))).round().to(torch.uint8)
 
 
 @pytest.mark.slow(gate=["False"])
