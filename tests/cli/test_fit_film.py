@@ -14,6 +14,7 @@ from PIL import Image
 from shared import refused, seeded, value_error
 from small_scenes import guess
 
+import gaussian_swaying
 from gaussian_swaying.cli.fit import main
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.inverse import from_film
@@ -67,6 +68,21 @@ def test_the_file_that_a_fit_reads(checked):
     assert len(video.times) == pytest.approx(30, abs=2)
     eye = camera_of(270, 480).position
     assert (video.cameras[0].position - eye).norm() < 0.02 * eye.norm()
+
+
+def test_a_film_is_fitted_from_python_as_from_the_command_line(case, checked, tmp_path, monkeypatch, capsys):
+    """The same plan in the same places; what has another type is refused."""
+    monkeypatch.setattr(from_film, "run_fit", lambda plan, output, **settings: (plan, output, settings))
+    given = {"up": "+z", "focal": 36.2, "device": "cpu", "progress": False}
+    film, splat, output = case / "film.mp4", case / "my.ply", tmp_path / "out"
+    plan, folder, settings = gaussian_swaying.fit_film(film, splat, output, length=("pole", 2.5), **given)
+    same = read_plan(checked / "fit.yaml")
+    for name in ("unknowns", "known", "assumed", "until", "search"):
+        assert getattr(plan, name) == getattr(same, name)
+    assert (folder, settings["in_use"]) == (output / "result", [output / "fit.yaml"])
+    assert capsys.readouterr().out == ""
+    with pytest.raises((TypeError, ValueError), match="`length` of fit_film"):
+        gaussian_swaying.fit_film(film, splat, output, length=2.5)
 
 
 def test_the_pictures_before_the_fit(checked):
