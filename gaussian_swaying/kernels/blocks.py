@@ -255,6 +255,20 @@ class Emitter:
         made = Block(whole[sign](a.value, b.value), a.kind, a.shape)
         return self._with_stride(made, sign, a, b) if sign in "+-*" and a.lanes > 1 else made
 
+    def rounded(self, sign: str, x: Value, y: Value) -> Block:
+        """A sum, product or quotient that is rounded as written: no part of it is fused with another."""
+        a, b = self.matched(x, y)
+        made = {"+": self.builder.fadd, "*": self.builder.fmul, "/": self.builder.fdiv}[sign](a.value, b.value)
+        return Block(made, a.kind, a.shape)
+
+    def negative(self, x: Block) -> Block:
+        """-x, of floating point numbers."""
+        return Block(self.builder.fneg(x.value), x.kind, x.shape)
+
+    def bits(self, x: Block, kind: str) -> Block:
+        """The bits of numbers as those of another type."""
+        return Block(self.builder.bitcast(x.value, self.type_of(kind, x.lanes)), kind, x.shape)
+
     def _with_stride(self, made: Block, sign: str, a: Block, b: Block) -> Block:
         if a.first is None or b.first is None:
             return made

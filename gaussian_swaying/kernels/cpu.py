@@ -10,11 +10,13 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import itertools
+import math
 import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
@@ -329,8 +331,31 @@ class Recording:
         self.parts, self.held, self._rows = [], [], {}
 
 
+@dataclass(frozen=True)
+class Noted:
+    """A launch that was noted: what is compiled for it, the grid and its arguments in words of eight bytes, tensors."""
+
+    kernel: Any
+    constants: dict[str, Any]
+    kinds: dict[str, str]
+    real: str
+    arguments: Any
+    tensors: Sequence[Tensor]
+
+    @property
+    def key(self) -> Any:
+        """What is compiled."""
+        return self.kernel, tuple(self.constants.items()), tuple(self.kinds.values()), self.real
+
+    @property
+    def programs(self) -> int:
+        """Number of its programs."""
+        return int(math.prod(self.arguments[:3]))
+
+
 class _Current(threading.local):
     recording: Recording | None = None
+    notes: list[Noted] | None = None
 
 
 _current = _Current()
@@ -347,8 +372,21 @@ def recording() -> Iterator[Recording]:
         _current.recording = outer
 
 
+@contextmanager
+def noted() -> Iterator[list[Noted]]:
+    """Within the block, launches of this thread are noted but not run, and what :func:`call` gets is left out."""
+    made: list[Noted] = []
+    _current.notes = made
+    try:
+        yield made
+    finally:
+        _current.notes = None
+
+
 def call(change: Callable[[], object]) -> None:
     """Call a function between launches, and note it if they are recorded."""
+    if _current.notes is not None:
+        return
     change()
     if _current.recording is not None:
         _current.recording.call(change)
@@ -399,6 +437,9 @@ def launch(kernel: Any, grid: Sequence[int], *given: Any, **named: Any) -> None:
     if programs == 0:
         return
     arguments = (ctypes.c_int64 * (3 + len(words)))(*axes, *words)
+    if _current.notes is not None:
+        _current.notes.append(Noted(kernel, constants, kinds, real, arguments, tensors))
+        return
     address = _address(kernel, constants, kinds, real)
     if _current.recording is not None:
         _current.recording.add(address, arguments, programs, tensors)

@@ -22,31 +22,31 @@ _ROUNDS = 12582912.0  # 1.5 * 2^23: adding it leaves an integer in the low bits
 
 def exp(emit: Emitter, x: Block) -> Block:
     """e^x within 2 ulp; 0 below -104, infinity above 89, NaN of NaN."""
-    add, times = partial(_rounded, emit, "+"), partial(_rounded, emit, "*")
+    add, times = partial(emit.rounded, "+"), partial(emit.rounded, "*")
     x = emit.where(emit.compare(">", x, 89.0), 89.0, emit.where(emit.compare("<", x, -104.0), -104.0, x))
     shifted = add(times(x, math.log2(math.e)), _ROUNDS)
     n = add(shifted, -_ROUNDS)
     r = add(add(x, times(n, -_LN2[0])), times(n, -_LN2[1]))
     value = add(add(times(_polynomial(emit, r, _EXP), times(r, r)), r), 1.0)
-    whole = emit.arithmetic("-", _bits(emit, shifted), 0x4B400000)
+    whole = emit.arithmetic("-", emit.bits(shifted, "i32"), 0x4B400000)
     # in two steps, as 2^n alone may be too large or too small for a number
     half = emit.arithmetic(">>", whole, 1)
     for part in (half, emit.arithmetic("-", whole, half)):
         power = emit.arithmetic("<<", emit.arithmetic("+", part, 127), 23)
-        value = times(value, _float(emit, power))
+        value = times(value, emit.bits(power, "f32"))
     return value
 
 
 def log(emit: Emitter, x: Block) -> Block:
     """The natural logarithm within 2 ulp; -infinity of 0, NaN of negative numbers and of NaN."""
-    add, times = partial(_rounded, emit, "+"), partial(_rounded, emit, "*")
+    add, times = partial(emit.rounded, "+"), partial(emit.rounded, "*")
     tiny = emit.compare("<", x, 2.0**-126)
-    bits = _bits(emit, emit.where(tiny, times(x, 2.0**23), x))
+    bits = emit.bits(emit.where(tiny, times(x, 2.0**23), x), "i32")
     # x = 2^n (1 + f) with 1 + f from sqrt(1/2) to sqrt(2)
     above = emit.arithmetic("-", bits, 0x3F3504F3)
     exponent = emit.arithmetic(">>", above, 23)
     mantissa = emit.arithmetic("+", emit.arithmetic("&", above, 0x007FFFFF), 0x3F3504F3)
-    f = add(_float(emit, mantissa), -1.0)
+    f = add(emit.bits(mantissa, "f32"), -1.0)
     n = emit.convert(emit.arithmetic("-", exponent, emit.where(tiny, 23, 0)), "f32")
     square = times(f, f)
     value = add(times(times(_polynomial(emit, f, _LOG), f), square), times(n, _LN2[1]))
@@ -61,19 +61,3 @@ def _polynomial(emit: Emitter, x: Block, factors: tuple[float, ...]) -> Block:
     for factor in factors[1:]:
         value = emit.arithmetic("+", emit.arithmetic("*", value, x), factor)
     return value
-
-
-def _rounded(emit: Emitter, sign: str, x: Block, y: Block | float) -> Block:
-    """A sum or a product that is rounded as written: no part of it is fused with another."""
-    a, b = emit.matched(x, y)
-    made = (emit.builder.fadd if sign == "+" else emit.builder.fmul)(a.value, b.value)
-    return Block(made, a.kind, a.shape)
-
-
-def _bits(emit: Emitter, x: Block) -> Block:
-    return Block(emit.builder.bitcast(x.value, emit.type_of("i32", x.lanes)), "i32", x.shape)
-
-
-def _float(emit: Emitter, bits: Block) -> Block:
-    value = emit.builder.bitcast(bits.value, emit.type_of("f32", bits.lanes))
-    return Block(value, "f32", bits.shape)

@@ -277,23 +277,20 @@ class Translator(Emitter):
                 if found is not None:
                     return found
             return None
-        b = self.builder
+        name, counter = node.target.id, f"counter {node.target.id}"
         start, end, step = self.matched(values.start, values.end, values.step)
-        kind = start.kind
-        place = self.entry.alloca(TYPES[kind])
-        b.store(start.value, place)
+        scope[counter] = start
 
         def more() -> Block:
-            return self.compare("<", Block(b.load(place, typ=TYPES[kind]), kind), end)
+            return self.compare("<", scope[counter], end)
 
         def body(inner: Scope) -> None:
-            now = Block(b.load(place, typ=TYPES[kind]), kind)
-            inner[node.target.id] = now  # type: ignore[attr-defined]
+            inner[name] = inner[counter]
             if self._run(node.body, inner) is not None:
                 raise TranslationError("cannot return from a loop")
-            b.store(b.add(now.value, step.value), place)
+            inner[counter] = self.arithmetic("+", inner[counter], step)
 
-        self._repeat(_assigned(node.body), more, body, scope)
+        self._repeat(_assigned(node.body) | {counter}, more, body, scope)
         return None
 
     def _while(self, node: ast.While, scope: Scope) -> None:
@@ -483,7 +480,7 @@ class Translator(Emitter):
         if is_number(x):
             return -x if isinstance(op, ast.USub) else ~x if isinstance(op, ast.Invert) else +x
         if isinstance(op, ast.USub):
-            return Block(self.builder.fneg(x.value), x.kind, x.shape) if x.floating else self.arithmetic("-", 0, x)
+            return self.negative(x) if x.floating else self.arithmetic("-", 0, x)
         if isinstance(op, ast.Invert):
             return self.arithmetic("^", x, True if x.kind == "i1" else -1)
         return x
@@ -601,7 +598,7 @@ class Translator(Emitter):
             case "cumsum":
                 return lambda x, axis=0: self.running_sum(x) if x.shape[axis] == x.lanes else x
             case "div_rn":
-                return self._exact_quotient
+                return partial(self.rounded, "/")
             case "debug_barrier":  # the lanes of a program need not wait for each other here
                 return lambda: None
         raise TranslationError(f"`tl.{name}` is not translated")
@@ -617,10 +614,6 @@ class Translator(Emitter):
         if block.kind != "f32":
             return self.unary(name, block)
         return (elementary.exp if name == "exp" else elementary.log)(self, block)
-
-    def _exact_quotient(self, x: Value, y: Value) -> Block:
-        a, b = self.matched(x, y)
-        return Block(self.builder.fdiv(a.value, b.value), a.kind, a.shape)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Writes recordings of a CPU as one WebAssembly module and an image of the memory that it works in.
+"""Writes noted launches of a CPU as one WebAssembly module and an image of the memory that it works in.
 
 The kernels are translated again and compiled by LLVM for WebAssembly. Its object file is a module already, but for the
 exports, so no linker is needed. The module imports ``env.__linear_memory``, which must hold the image, the global
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import bisect
 import ctypes
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -22,7 +22,7 @@ from gaussian_swaying.kernels.blocks import ADDRESS, TYPES, Block, Value
 from gaussian_swaying.kernels.translator import Translator
 
 LANES = 4
-"""Lanes of a vector: make recordings within ``launch.narrowed(LANES)``."""
+"""Lanes of a vector: note launches within ``launch.narrowed(LANES)``."""
 
 START = 2**16
 """Where the image starts; below it are the constants of the code and the stack."""
@@ -37,16 +37,18 @@ class Image:
     """A program for a browser.
 
     Attributes:
-        modules: WebAssembly modules, which export a function without arguments for each recording: one that multiplies
+        modules: WebAssembly modules, which export functions without arguments: one that multiplies
             and adds in one instruction (relaxed SIMD, where the larger of NaN and a number may be NaN), and one for
             browsers that cannot.
         memory: What the memory holds from :data:`START` on.
         places: First byte in the memory, and number of bytes, of each tensor that was asked for.
+        place: The byte of the memory for an address of a tensor.
     """
 
     modules: tuple[bytes, bytes]
     memory: bytes
     places: dict[str, tuple[int, int]]
+    place: Callable[[int], int]
 
 
 class _Translator(Translator):
@@ -67,39 +69,37 @@ class _Translator(Translator):
         return self.where(self.compare("==", b, b), found, a)  # b is not NaN
 
 
-def image(recordings: Mapping[str, cpu.Recording], tensors: Mapping[str, Tensor]) -> Image:
-    """The module of some recordings, and the memory as it is now.
-
-    Functions that were recorded between launches are left out: what they do, such as counting substeps, is left to the
-    program that calls the module.
+def image(
+    launches: Mapping[str, Sequence[cpu.Noted]], tensors: Mapping[str, Tensor], others: Sequence[cpu.Noted] = ()
+) -> Image:
+    """The module of some noted launches, and the memory as it is now.
 
     Args:
-        recordings: The recordings, by the names of their functions.
+        launches: The launches, by the names of their functions.
         tensors: Contiguous tensors whose places in the memory are wanted; launches may use them or not.
+        others: Launches whose tensors the memory holds, too.
     """
-    held = [tensor for made in recordings.values() for _, given in made.held for tensor in given]
-    memory = _Memory([*held, *tensors.values()])
-    keys = {address: key for key, address in cpu._COMPILED.items()}
+    every = [*(one for made in launches.values() for one in made), *others]
+    memory = _Memory([*(tensor for one in every for tensor in one.tensors), *tensors.values()])
     module = ir.Module()
-    kernels: dict[int, ir.Function] = {}
+    kernels: dict[Any, ir.Function] = {}
     module.triple, module.data_layout = _TARGET, str(_machine("").target_data)
-    for name, made in recordings.items():
+    for name, made in launches.items():
         function = ir.Function(module, ir.FunctionType(ir.VoidType(), []), name)
         builder = ir.IRBuilder(function.append_basic_block())
-        launches = [launch for part in made.parts if isinstance(part, list) for launch in part]
-        for address, arguments, programs in launches:
-            if address not in kernels:
-                kernels[address] = _kernel(module, keys[address], f"kernel {len(kernels)}")
-            row = memory.add(_moved(arguments, keys[address][2], memory))
+        for one in made:
+            if one.key not in kernels:
+                kernels[one.key] = _kernel(module, one, f"kernel {len(kernels)}")
+            row = memory.add(_moved(one, memory))
             place = ir.Constant(TYPES["i32"], row).inttoptr(ADDRESS)
-            builder.call(kernels[address], [place, TYPES["i64"](0), TYPES["i64"](programs)])
+            builder.call(kernels[one.key], [place, TYPES["i64"](0), TYPES["i64"](one.programs)])
         builder.ret_void()
     text = str(module)
     fused, plain = (
-        _with_exports(cpu._compiled(text, _machine(more)), tuple(recordings)) for more in (",+relaxed-simd", "")
+        _with_exports(cpu._compiled(text, _machine(more)), tuple(launches)) for more in (",+relaxed-simd", "")
     )
     places = {name: (memory.place(tensor.data_ptr()), tensor.nbytes) for name, tensor in tensors.items()}
-    return Image((fused, plain), bytes(memory.content), places)
+    return Image((fused, plain), bytes(memory.content), places, memory.place)
 
 
 @cache
@@ -110,13 +110,10 @@ def _machine(more: str) -> Any:
     return cpu._machine_for(_TARGET, "generic", _FEATURES + more)
 
 
-def _kernel(module: ir.Module, key: Any, name: str) -> ir.Function:
-    kernel, constants, kinds, real = key
-    names, constant = cpu._parameters(kernel)
-    translator = _Translator(real)
+def _kernel(module: ir.Module, noted: cpu.Noted, name: str) -> ir.Function:
+    translator = _Translator(noted.real)
     translator.module = module
-    given = dict(zip((each for each in names if each not in constant), kinds, strict=True))
-    translator.kernel(kernel, dict(constants), given, name)
+    translator.kernel(noted.kernel, noted.constants, noted.kinds, name)
     function: ir.Function = module.get_global(name)
     function.attributes.add("noinline")
     return function
@@ -151,10 +148,10 @@ class _Memory:
         return self._places[k] + address - self._starts[k] if k >= 0 and address < self._ends[k] else 0
 
 
-def _moved(arguments: Any, kinds: tuple[str, ...], memory: _Memory) -> bytes:
+def _moved(noted: cpu.Noted, memory: _Memory) -> bytes:
     """Arguments with the new places of their tensors; WebAssembly reads the lower half of an address."""
-    made = type(arguments)(*arguments)
-    for k, kind in enumerate(kinds, 3):
+    made = type(noted.arguments)(*noted.arguments)
+    for k, kind in enumerate(noted.kinds.values(), 3):
         if kind[0] == "*":
             made[k] = memory.place(made[k])
     return bytes(made)

@@ -479,7 +479,7 @@ class TotalRun(Run):
         self.fields = torch.zeros(len(inverse), 8, **self.like)
         self.displacement, self.velocity = self.fields[:, :4], self.fields[:, 4:]
         self.lanes = lanes(self.device, _lanes(sizes))
-        self._cut(sizes)
+        self.cut(sizes, lanes(self.device, _PROGRAMS, 1))
         nodes = (*points.position.shape[:-2], grid.node_count, 3)
         vector, matrix = points.position.shape, torch.Size((*points.position.shape, 3))
         self.shapes = {"position": vector, "velocity": vector, "affine": matrix, "F": matrix}
@@ -502,7 +502,8 @@ class TotalRun(Run):
         self.shift = torch.zeros(len(inverse) if self.position else 0, 4, **self.like)
         # a CPU sums the cells around a node by a kernel of its own (`total_join`), without the last row of each of the
         # 27, which is of no cell
-        joined = self.source[:, : None if lanes(self.device, 0) else 0]
+        self.joins = lanes(self.device, 16, 1) == 1
+        joined = self.source[:, : None if self.joins else 0]
         self.source_counts = (joined % (self.cells + 1) != self.cells).sum(0, dtype=torch.int32)
         self.joined = torch.zeros(joined.shape[1], 8, **self.like)
         self.alone = torch.arange(len(self.joined), dtype=torch.int32, device=self.device)
@@ -564,9 +565,13 @@ class TotalRun(Run):
             check_indices(self.points.push.numel())
             self.residual = torch.zeros(2, self.points.node.shape[1], 4, **self.like)  # now, and its sum
 
-    def _cut(self, sizes: Tensor) -> None:
-        """Cut crowded cells into pieces: otherwise a body of few cells has too few programs to fill a GPU."""
-        programs = lanes(self.device, _PROGRAMS, 1)
+    def cut(self, sizes: Tensor, programs: int) -> None:
+        """Cut crowded cells into pieces: otherwise a body of few cells has too few programs to fill a GPU.
+
+        Args:
+            sizes: Number of particles of each cell.
+            programs: Least number of pieces.
+        """
         most = self.lanes * max(1, -(-self.count // (self.lanes * programs)))
         counts = -(-sizes // most)
         first = counts.cumsum(0) - counts
@@ -675,7 +680,7 @@ class TotalRun(Run):
             self._bend(self.fields, partial, width)
         nodes, block = len(self.active), lanes(self.device, 16, 1)
         source, sources = self.source, len(self.source)
-        if block == 1:
+        if self.joins:
             launch(kernels.total_join, (nodes,))(source, self.source_counts, nodes, partial, self.joined, WIDTH=width)
             source, sources, partial = self.alone, 1, self.joined
         held = self.plain and any(self.bound.on_nodes)

@@ -1,13 +1,16 @@
-"""Recordings of a CPU as WebAssembly, in Node.js."""
+"""Noted launches of a CPU as WebAssembly, in Node.js, and as shaders."""
 
 import subprocess
+from functools import partial
 
 import pytest
 import torch
 
 from gaussian_swaying.kernels import cpu, wasm
+from gaussian_swaying.kernels.blocks import TranslationError
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.kernels.launch import launch, narrowed
+from gaussian_swaying.kernels.wgsl import shaders
 from gaussian_swaying.simulation.simulation import Simulation
 
 # Runs each module that Node.js knows on the image, and writes the memory after it beside the module.
@@ -86,11 +89,13 @@ def test_kernels_give_the_numbers_of_the_cpu(in_node):
     y = torch.tensor([2.0, nan, 1.0, -inf, 0.7, 1e-3, 5.0, inf, -4.0, 1.0])
     place = torch.tensor([0, 1, 2, 3, 4, 5, 6, 7, 9, 8], dtype=torch.int32)
     out, whole = torch.zeros(10, 10), torch.zeros(11, dtype=torch.int32)
-    with cpu.recording() as made:
-        launch(_words, (3,))(x, y, place, out, whole, 10, 0.5, BLOCK=wasm.LANES)
+    again = partial(launch(_words, (3,)), x, y, place, out, whole, 10, 0.5, BLOCK=wasm.LANES)
+    with cpu.noted() as made:
+        again()
     image = wasm.image({"words": made, "again": made}, {"out": out, "whole": whole})
-    made.replay()
-    made.replay()
+    assert not whole.any()
+    again()
+    again()
     *relaxed, exact = in_node(image, out=out, whole=whole)
     torch.testing.assert_close(exact["out"], out, rtol=4e-7, atol=1e-7, equal_nan=True)
     for found in relaxed:
@@ -107,13 +112,13 @@ def test_the_first_flag_flies_as_on_the_cpu(in_node, request):
         run, force = simulation.solver.kernels, simulation.stepper.wind_force
         options = run.options_for([force.device_function()])
         run.first_step.zero_()
-        with cpu.recording() as made:
+        with cpu.noted() as made:
             for k in range(16):
                 run.substep(k, options)
-    image = wasm.image({"first": made, "second": made}, {"fields": run.fields})
-    before = run.displacement.clone()
-    made.replay()
-    made.replay()
+        image = wasm.image({"first": made, "second": made}, {"fields": run.fields})
+        before = run.displacement.clone()
+        for k in range(32):
+            run.substep(k % 16, options)
     motion = float((run.displacement - before).abs().max())
     assert motion > 0.02  # m
     for found in in_node(image, fields=run.fields):
@@ -124,9 +129,17 @@ def test_tensors_that_share_numbers_still_do(in_node):
     """Those that no launch uses have a place, too."""
     x = torch.arange(24, dtype=torch.float32)
     half, other = x[12:], torch.full((3,), 7.0)
-    made = cpu.Recording()
-    image = wasm.image({"nothing": made}, {"x": x, "half": half, "other": other})
+    image = wasm.image({"nothing": []}, {"x": x, "half": half, "other": other})
     assert image.places["half"][0] == image.places["x"][0] + 48
     for found in in_node(image, x=x, half=half, other=other):
         assert found["half"].tolist() == half.tolist()
         assert found["other"].tolist() == [7.0] * 3
+
+
+@pytest.mark.parametrize(("dtype", "why"), [(torch.float64, "double precision"), (torch.float32, "largest")])
+def test_what_shaders_do_not_have_is_refused(dtype, why):
+    x, whole = torch.zeros(10, dtype=dtype), torch.zeros(11, dtype=torch.int32)
+    with cpu.noted() as made:
+        launch(_words, (10,))(x, x, whole, x.new_zeros(10, 10), whole, 10, 0.5, BLOCK=1)
+    with pytest.raises(TranslationError, match=why):
+        shaders({"words": made}, lambda address: 0)

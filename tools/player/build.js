@@ -6,7 +6,7 @@ import { readFile } from "node:fs/promises";
 
 const OWN = "brush.js build.js bundle.js film.glsl.js film.js gaussians.js live.js main.js playback.js sorter.js view.js".split(" ");
 OWN.push(..."dial.js page.js settings.js".split(" ").map((name) => `live_web/${name}`));
-const SOLVER = "aero.js block.js body.js kernels.js modal.js solver.js substep.wgsl touch.wgsl webgpu.js wind.js worker.js"
+const SOLVER = "aero.js block.js body.js modal.js solver.js webgpu.js wind.js worker.js"
   .split(" ")
   .map((name) => `live_web/${name}`);
 const SOURCES = [...OWN, "package-lock.json"]; // a test compares their checksum
@@ -60,14 +60,6 @@ await build({
   logLevel: "info",
 });
 
-// Shaders without comments and indents.
-async function readShader({ path }) {
-  const lines = (await readFile(path, "utf8")).replace(/\/\*[^]*?\*\/|\/\/.*/g, "").split("\n");
-  return { contents: lines.map((line) => line.trim()).filter(Boolean).join("\n"), loader: "text" };
-}
-
-const shaders = { name: "shaders", setup: (made) => made.onLoad({ filter: /\.wgsl$/ }, readShader) };
-
 await build({
   entryPoints: ["live_web/worker.js"],
   outfile: "../../gaussian_swaying/viewer/live_web/page/worker.min.js",
@@ -77,5 +69,4 @@ await build({
   format: "iife",
   banner: await banner(["build.js", ...SOLVER, "package-lock.json"]),
   logLevel: "info",
-  plugins: [shaders],
 });

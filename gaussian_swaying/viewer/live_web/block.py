@@ -14,10 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gaussian_swaying.geometry.regions import Box, Capsule, HalfSpace, Sphere
 from gaussian_swaying.kernels.launch import compiles
 from gaussian_swaying.mpm.colliders import Obstacle
-from gaussian_swaying.mpm.laws.elastic import FixedCorotated, NeoHookean, SpringNetwork, StVKHencky
 from gaussian_swaying.mpm.modes import Modes
 from gaussian_swaying.mpm.pins import PinnedPoints, PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
@@ -31,12 +29,6 @@ from gaussian_swaying.wind.field import GaussianGust, SineSway, UniformGust, Win
 from gaussian_swaying.wind.force import LAWS as AERO_LAWS
 from gaussian_swaying.wind.force import WindForce
 from gaussian_swaying.wind.turbulence import Turbulence
-
-LAWS = (FixedCorotated, NeoHookean, StVKHencky, SpringNetwork)
-"""The laws that a browser knows, by their number in the block."""
-
-OBSTACLES = {HalfSpace: "half_space", Sphere: "capsule", Capsule: "capsule", Box: "box"}
-"""The shapes of obstacles that a browser knows, as long as they stand still."""
 
 
 def check(simulation: Simulation) -> None:
@@ -78,9 +70,8 @@ def check(simulation: Simulation) -> None:
     if not compiles("cpu") or model.points.position.dtype != torch.float32:
         raise _refused("what its kernels are not compiled for", "install llvmlite, and set `dtype` to float32")
     for law in model.points.laws:
-        if type(law) not in LAWS:
-            known = ", ".join(one.__name__ for one in LAWS)
-            raise _refused(f"the law {type(law).__name__} in `material.law`", f"take one of {known}")
+        if law.device is None:
+            raise _refused(f"the law {type(law).__name__} in `material.law`", "take one with device functions")
     for boundary in solver.boundaries:
         _check_boundary(boundary)
 
@@ -88,14 +79,11 @@ def check(simulation: Simulation) -> None:
 def _check_boundary(boundary: Any) -> None:
     name = type(boundary).__name__
     if isinstance(boundary, Obstacle):
-        name = type(boundary.shape).__name__
-        if type(boundary.shape) in OBSTACLES and boundary.still:
-            return
         if not boundary.still:
-            raise _refused(f"the `path` of the {name}", "leave it out")
+            raise _refused(f"the `path` of the {type(boundary.shape).__name__}", "leave it out")
+        return
     if type(boundary) not in (PinnedRegion, PinnedPoints):
-        known = ", ".join(one.__name__ for one in (PinnedRegion, PinnedPoints, Obstacle, *OBSTACLES))
-        raise _refused(f"the {name} in `solver.boundaries`", f"take one of {known}")
+        raise _refused(f"the {name} in `solver.boundaries`", "take a PinnedRegion, PinnedPoints or Obstacle")
     if boundary.moves:
         raise _refused(f"the `velocity` of the {name}", "leave it out")
     if not boundary.always:
@@ -132,61 +120,13 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
     if isinstance(bound, Modes):
         return _pack_modes(head, simulation, bound, nodes)
     force = simulation.stepper.wind_force
-    points, stencil = bound.points, bound.stencil
-    unit = stencil.cell
-    order = torch.argsort(unit, stable=True)
-    _, sizes = torch.unique_consecutive(unit[order], return_counts=True)
-    active = (bound.node_inverse_mass > 0).nonzero()[:, 0]
-    # nodes without mass do not move, and are one row after all others
-    row = torch.full_like(bound.node_mass, len(active), dtype=torch.long)
-    row[active] = torch.arange(len(active))
-    held = torch.zeros_like(bound.node_mass, dtype=torch.bool)
-    obstacles = []
-    for boundary, own, acts in zip(bound.boundaries, bound.pinned, bound.on_nodes, strict=True):
-        if isinstance(boundary, Obstacle):
-            obstacles.append(_obstacle(boundary))
-        elif acts:
-            assert own is not None
-            assert own.share is not None
-            held |= own.share > own.threshold
-    law = torch.zeros(points.count, dtype=torch.long) if points.law_index is None else points.law_index
-    numbers = torch.tensor([LAWS.index(type(one)) for one in points.laws])
-    arrays: dict[str, Tensor] = {
-        "cellStart": torch.cat([sizes.new_zeros(1), sizes.cumsum(0)]),
-        "cellNodes": row[stencil.node[order[sizes.cumsum(0) - sizes]]],
-        "fraction": stencil.fraction[:, order].T,
-        "rest": points.position[order],
-        "volume": points.volume[order],
-        "mass": points.mass[order],
-        "mu": bound.laws.mu[order],
-        "lam": bound.laws.lam[order],
-        "law": numbers[law][order],
-        "inverseMass": torch.nn.functional.pad(bound.node_inverse_mass[active], (0, 1)),
-        "held": held[active],
-        "nodeDamping": bound.node_damping[active] if bound.node_damping is not None else points.mass.new_zeros(0),
-        "followed": row[nodes],
-        **_wind_arrays(force, order),
-        **_samples(bound, row),
-    }
-    rows = 0
-    if bound.pinned_rows is not None:
-        dense = bound.pinned_rows.in_kernels(torch.float64)
-        rows = dense.push.shape[1]
-        arrays |= {"rowNode": row[dense.node.long()].T, "rowWeight": dense.weight.T}
-        arrays |= {"affected": row[dense.affected.long()], "push": dense.push}
-    else:
-        arrays |= {name: active.new_zeros(0) for name in ("rowNode", "affected")}
-        arrays |= {name: points.mass.new_zeros(0) for name in ("rowWeight", "push")}
-    head |= {
-        "cfl": solver.cfl,
-        "longest": max(solver.cfl, longest_courant(bound)),
-        "obstacles": obstacles,
-        "iterations": bound.contact.iterations if bound.contact is not None else 0,
-        "rows": rows,
-        "aero": _aero(force),
-    }
+    head |= {"cfl": solver.cfl, "longest": max(solver.cfl, longest_courant(bound))}
     kernels, more = pack_kernels(bound, None if head["idle"] else force)
     head |= {"kernels": kernels, "bending": float(bound.bending_rate) * settings.dx**2 / 6}
+    mass = bound.points.mass
+    explicit = not head["idle"] and force.aero.drag_step == "explicit"
+    rate = force.aero.rate(torch.ones_like(mass), force.area, mass) if explicit else mass[:0]
+    arrays = {"mass": mass, "rate": rate, "followed": nodes}
     return _joined(head, arrays | more)
 
 
@@ -202,7 +142,7 @@ def _pack_modes(head: dict[str, Any], simulation: Simulation, bound: Modes, node
         "ratio": bound.ratio - (head["damping"] / omega + head["viscous"] * omega) / 2,  # that of the material
         "rest": bound.site_rest,
         "mass": bound.site_mass,
-        **_wind_arrays(force, torch.arange(bound.sites)),
+        **_wind_arrays(force),
     }
     for name, shape in shapes.items():  # loads of one size move a mode by 1 / omega^2, at a rate of 1 / omega
         scaled = shape.double() / omega
@@ -234,31 +174,6 @@ def _joined(head: dict[str, Any], arrays: dict[str, Tensor]) -> bytes:
     return message(head | {"arrays": listed}, *blocks)
 
 
-def _obstacle(obstacle: Obstacle) -> dict[str, Any]:
-    kind = OBSTACLES[type(obstacle.shape)]
-    numbers = obstacle.numbers[:4] if kind == "capsule" else obstacle.numbers
-    if len(numbers) == 1:
-        numbers = torch.nn.functional.pad(numbers, (0, 3))
-    return {
-        "kind": kind,
-        "center": obstacle.center.tolist(),
-        "numbers": numbers.tolist(),
-        "friction": obstacle.friction,
-        "gap": obstacle.gap,
-        "start": obstacle.start,
-        "end": None if obstacle.end == math.inf else obstacle.end,
-    }
-
-
-def _samples(bound: Total, row: Tensor) -> dict[str, Tensor]:
-    """The samples of the surface that touch obstacles; ``row`` is the row of each node."""
-    none, contact = bound.node_mass.new_zeros(0), bound.contact
-    if contact is None:
-        return {"sampleNode": row[:0], "sampleWeight": none, "samplePlace": none, "sampleHalf": none}
-    place, half = contact.surface.place, 0.5 * contact.surface.thickness
-    return {"sampleNode": row[contact.node], "sampleWeight": contact.weight, "samplePlace": place, "sampleHalf": half}
-
-
 def _aero(force: WindForce) -> dict[str, Any]:
     aero = force.aero
     return {
@@ -272,27 +187,14 @@ def _aero(force: WindForce) -> dict[str, Any]:
     }
 
 
-def _wind_arrays(force: WindForce, order: Tensor) -> dict[str, Tensor]:
-    """The patches of each point: area vectors and the sum of A N N^T."""
-    sums, area = force.sums, force.area[order]
-    upper = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
-    if sums is None:
-        normal, own = force.normal[order], area > 0
-        vector = area[:, None] * normal
-        tensor = vector[:, upper[0]] * normal[:, upper[1]]
-        ends = torch.nn.functional.pad(own.cumsum(0), (1, 0))
-        return {"area": area, "tensor": tensor, "firstVector": ends, "vectors": vector[own]}
-    count = sums.point.bincount(minlength=len(order))
-    first = (count.cumsum(0) - count)[order]
-    own = torch.repeat_interleave(torch.arange(len(order)), count[order])
-    ends = count[order].cumsum(0)
-    within = torch.arange(len(own)) - (ends - count[order])[own]
-    return {
-        "area": area,
-        "tensor": sums.tensor[order][:, upper[0], upper[1]],
-        "firstVector": torch.cat([ends.new_zeros(1), ends]),
-        "vectors": sums.vector[first[own] + within],
-    }
+def _wind_arrays(force: WindForce) -> dict[str, Tensor]:
+    """The patches of each site: area vectors and the sum of A N N^T."""
+    sums = force.sums
+    assert sums is not None
+    ends = sums.point.bincount(minlength=len(force.area)).cumsum(0)
+    upper = sums.tensor[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    first = torch.cat([ends.new_zeros(1), ends])
+    return {"area": force.area, "tensor": upper, "firstVector": first, "vectors": sums.vector}
 
 
 def _wind(wind: Any) -> dict[str, Any]:

@@ -92,6 +92,7 @@ MIXED = {
     "springs, viscous, pinned points": both("springs, viscous", "nodes and a point, still air", "solver"),
     "linear, semi-implicit": CASES["linear, semi-implicit"],
     "one patch, cross flow": CASES["one patch, cross flow"],
+    "bending": CASES["bending"],
 }
 
 
@@ -103,24 +104,8 @@ def test_laws_forces_and_boundaries(make, on_gpu, name):
     assert [told[0]["name"], told[-1]["gpu"]] == ["webgpu", True]
     error, motion = apart(simulation, state, moved)
     assert motion > 5e-3
-    assert error < 1e-3
-    assert abs(told[-1]["substeps"] - steps) <= 0.02 * steps
-
-
-@pytest.mark.parametrize(("name", "law"), [("ground and ball", "FixedCorotated"), ("box", "StVKHencky")])
-def test_contact_with_what_stands_still(make, on_gpu, name, law):
-    """Within 1 % of the motion after a second, of which the obstacles stop a part."""
-    pins = CASES["nodes and a point, still air"]["solver"]["boundaries"][:1]
-    settings = {"material": {"law": {"class_path": law}}}
-    simulation = make(solver={"boundaries": [*pins, *OBSTACLES[name]]}, **settings)
-    state, steps = run(simulation, 25)
-    free, _ = run(make(solver={"boundaries": pins}, **settings), 25)
-    told, moved = on_gpu(simulation, {"kind": "frames", "count": 25})
-    error, motion = apart(simulation, state, moved)
-    assert told[-1]["gpu"]
-    assert longest(state.position - free.position) > 0.1 * motion
-    assert error < 0.01
-    assert abs(told[-1]["substeps"] - steps) <= 0.02 * steps
+    assert error < 1e-4
+    assert told[-1]["substeps"] == steps
 
 
 def test_a_page_after_two_seconds_and_after_its_device_is_lost(show, written, make):
@@ -165,11 +150,10 @@ def test_chosen_by_hand(show, written):
 BROKEN = "GPUDevice.prototype.createComputePipelineAsync = () => Promise.reject(new Error('no pipeline'));"
 OTHER = "Object.defineProperty(GPUAdapter.prototype, 'info', { value: { vendor: 'other' } });"
 ABSENT = "Object.defineProperty(navigator, 'gpu', { value: undefined });"
-MANY = OBSTACLES["ground and ball"][:1] * 33
 REASONS = {
     "its device failed: no pipeline": (BROKEN, {}),
     "this browser does not offer it": (ABSENT, {}),
-    "the scene has more than 32 obstacles": ("", {"solver": {"boundaries": MANY}}),
+    "something touches the material": ("", {"solver": {"boundaries": OBSTACLES["ground and ball"]}}),
 }
 
 

@@ -4,8 +4,8 @@ import { Wind } from "./wind.js";
 /** @typedef {{held: Float64Array, offset: Float64Array, target: Float64Array}} Pull See gaussian_swaying/viewer/pull.py. */
 
 const REACH = 0.06; // radius of what is pulled, as a share of the longest side
-export const QUICK = 40; // 1/s
-export const STRONGEST = 400; // m/s²
+const QUICK = 40; // 1/s
+const STRONGEST = 400; // m/s²
 
 /**
  * Spring and damper on a point that is pulled: adds up to a force [N] in `out` 0 to 2.
@@ -30,7 +30,6 @@ export class Body {
     this.a = arrays;
     this.points = arrays.mass.length;
     this.wind = new Wind(head.wind, arrays.turbulence);
-    this.aero = { ...head.aero, maxAreaRatio: head.aero.maxAreaRatio ?? Infinity };
     this.idle = head.idle;
     /** Stiffness, as a multiple of that in the file. */
     this.stiffness = 1;
@@ -46,7 +45,7 @@ export class Body {
    * @returns {number[] | null} the place [m]
    */
   grab(eye, ray, wide) {
-    const { rest, mass } = this.a;
+    const { mass } = this.a;
     const position = new Float64Array(3 * this.points);
     let [best, at] = [Infinity, -1];
     this.positions(position);

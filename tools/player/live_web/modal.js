@@ -11,6 +11,7 @@ export class ModalSolver extends Body {
   constructor(block) {
     super(block);
     const { head, arrays } = block;
+    this.aero = { ...head.aero, maxAreaRatio: head.aero.maxAreaRatio ?? Infinity };
     const { omega } = arrays;
     const count = omega.length;
     for (const name of head.modes)

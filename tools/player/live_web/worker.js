@@ -1,8 +1,8 @@
 // Runs the solver beside the page, in step with the clock. What it understands is in `does`, what it says in `post`.
 import { readBlock } from "./block.js";
-import { KernelSolver } from "./kernels.js";
 import { ModalSolver } from "./modal.js";
-import { GpuSolver, NoWebGPU, openGpu } from "./webgpu.js";
+import { Solver } from "./solver.js";
+import { NoWebGPU, openGpu } from "./webgpu.js";
 
 const BEHIND = 0.25; // s that it may be late before it stops trying to catch up
 const WINDOW = 2000; // ms, over which the speed is measured
@@ -14,8 +14,6 @@ const BREATH = 4; // ms between frames, in which it hears what the page says
 
 /** @type {any} */
 let solver;
-/** The one that needs no graphics card. @type {any} */
-let processor;
 /** @type {{head: any, arrays: Record<string, any>}} */
 let block;
 let wanted = ""; // "auto", "webgpu" or "worker": where the motion is computed
@@ -39,17 +37,14 @@ const queue = (/** @type {() => any} */ task) => (chain = chain.then(task).catch
 
 /** Says what computes, and why it is not WebGPU, once that is known. @param {string | null} why */
 function tell(why = null) {
-  const name = solver instanceof GpuSolver ? "webgpu" : solver instanceof KernelSolver ? "webassembly" : "javascript";
+  const name = solver.gpu ? "webgpu" : solver instanceof Solver ? "webassembly" : "javascript";
   post({ kind: "solver", name, why });
 }
 
-/** Another solver goes on with the motion. @param {any} next @param {string | null} why */
-function takeOver(next, why = null) {
-  for (const name of ["displacement", "velocity"]) next[name].set(solver[name]);
-  const { time, substep, stiffness, hurried, pull, wind, first } = solver;
-  Object.assign(next, { time, substep, stiffness, hurried, pull, wind, first });
-  if (solver instanceof GpuSolver) solver.device.destroy();
-  solver = next;
+/** The motion goes on in a graphics card, or with null in the processor. @param {any} gpu @param {string | null} why */
+function takeOver(gpu, why = null) {
+  solver.gpu?.device.destroy();
+  solver.gpu = gpu;
   past = [];
   tell(why);
 }
@@ -57,17 +52,17 @@ function takeOver(next, why = null) {
 /** Computes as is wanted, as far as possible; until WebGPU is there, the processor does. */
 async function choose() {
   if (wanted === "worker") {
-    if (solver instanceof GpuSolver) takeOver(processor);
+    if (solver.gpu) takeOver(null);
     return;
   }
-  if (solver instanceof GpuSolver) return;
+  if (solver.gpu) return;
   if (solver instanceof ModalSolver) return tell("the object sways by modes");
   try {
-    const found = await openGpu(block, processor, wanted === "webgpu");
+    const found = await openGpu(block, wanted === "webgpu");
     queue(() => {
-      if (wanted === "worker" || solver instanceof GpuSolver) return found.device.destroy();
+      if (wanted === "worker" || solver.gpu) return found.device.destroy();
       takeOver(found);
-      found.device.lost.then(() => queue(() => solver === found && takeOver(processor, found.broken)));
+      found.device.lost.then(() => queue(() => solver.gpu === found && takeOver(null, found.broken)));
     });
   } catch (error) {
     tell(/** @type {Error} */ (error).message);
@@ -80,7 +75,7 @@ async function forward() {
     return await solver.advance();
   } catch (error) {
     if (!(error instanceof NoWebGPU)) throw error;
-    takeOver(processor, error.message);
+    takeOver(null, error.message);
     return solver.advance();
   }
 }
@@ -109,9 +104,9 @@ function hurry() {
     solver.hurried = hurried;
     past = [];
   } else if (late && !settled && wanted === "auto" && found.wall > FULL * WINDOW) {
-    if (solver instanceof GpuSolver) {
+    if (solver.gpu) {
       slow = found.rate;
-      takeOver(processor, "it is too slow here");
+      takeOver(null, "it is too slow here");
     } else if (slow !== null) {
       settled = true;
       if (found.rate < slow) choose();
@@ -156,7 +151,7 @@ function restart() {
 const does = {
   load(given) {
     block = readBlock(given.bytes);
-    solver = processor = block.head.modes ? new ModalSolver(block) : new KernelSolver(block);
+    solver = block.head.modes ? new ModalSolver(block) : new Solver(block);
     show();
     tell();
   },
@@ -200,10 +195,10 @@ const does = {
     let substeps = 0;
     for (let k = 0; k < count; k++) substeps += await forward();
     show();
-    post({ kind: "done", gpu: solver instanceof GpuSolver, kernels: solver instanceof KernelSolver, substeps, seconds: (performance.now() - began) / 1000, simulated: count * solver.head.frameDt });
+    post({ kind: "done", gpu: !!solver.gpu, kernels: solver instanceof Solver && !solver.gpu, substeps, seconds: (performance.now() - began) / 1000, simulated: count * solver.head.frameDt });
   },
   lose() {
-    if (solver instanceof GpuSolver) solver.device.destroy();
+    solver.gpu?.device.destroy();
   },
 };
 
