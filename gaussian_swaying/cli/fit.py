@@ -6,6 +6,7 @@ import argparse
 import math
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +17,11 @@ from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.runs.signals import stop_signals
 from gaussian_swaying.simulation.simulation import Simulation
 
-MEMORY = "a smaller `search`, fewer `tracks`, a coarser `solver.dx` or smaller videos"
-
 
 def build_parser() -> argparse.ArgumentParser:
     """The options."""
-    parser = argparse.ArgumentParser(
-        prog=program.name("fit"),
-        description="Find the wind and the material of a splat from videos of its motion: a table of values with "
-        "errors, pictures of what is left, and a configuration for `sim`.",
-    )
+    told = "Find the wind and the material of a splat from videos: values, pictures, a configuration for `sim`."
+    parser = argparse.ArgumentParser(prog=program.name("fit"), description=told)
     add = parser.add_argument
     add("film", nargs="?", metavar="FILM", help="a film that begins with the object at rest")
     add("--splat", metavar="SPLAT", help="the splat that the film shows")
@@ -59,8 +55,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return None
         return f"All steps that were done are kept. To continue:\n  {begun[0]}" if begun else "Nothing was fitted yet."
 
+    work = lambda: fit(parser.parse_args(arguments), begun)  # noqa: E731
     return run_command(
-        lambda: fit(parser.parse_args(arguments), begun), memory=MEMORY, arguments=arguments, advice=advice
+        work,
+        memory="a smaller `search`, fewer `tracks`, a coarser `solver.dx` or smaller videos",
+        arguments=arguments,
+        advice=advice,
     )
 
 
@@ -101,10 +101,9 @@ def _length(given: Sequence[str] | None) -> Any:
     if given is None or list(given) == ["gravity"]:
         return given and "gravity"
     metres = " ".join(given[1:]) or "nothing"
-    try:
+    value = math.nan
+    with suppress(ValueError):
         value = float(metres)
-    except ValueError:
-        value = math.nan
     if not 0 < value < math.inf:
         raise ValueError(
             f"Expected `--length` to be gravity, or a name and a length in metres, such as pole 2.4, but got {metres}."
