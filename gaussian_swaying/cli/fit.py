@@ -17,6 +17,8 @@ from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.runs.signals import stop_signals
 from gaussian_swaying.simulation.simulation import Simulation
 
+MEMORY = "a smaller `search`, fewer `tracks`, a coarser `solver.dx` or smaller videos"
+
 
 def build_parser() -> argparse.ArgumentParser:
     """The options."""
@@ -50,17 +52,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = joined(sys.argv[1:] if arguments is None else arguments)
     parser, begun = build_parser(), list[str]()
 
-    def advice(error: BaseException) -> str | None:
-        if not isinstance(error, KeyboardInterrupt):
-            return None
-        return f"All steps that were done are kept. To continue:\n  {begun[0]}" if begun else "Nothing was fitted yet."
+    def after(error: BaseException) -> str | None:
+        told = f"All steps that were done are kept. To continue:\n  {begun[0]}" if begun else "Nothing was fitted yet."
+        return told if isinstance(error, KeyboardInterrupt) else None
 
-    work = lambda: fit(parser.parse_args(arguments), begun)  # noqa: E731
     return run_command(
-        work,
-        memory="a smaller `search`, fewer `tracks`, a coarser `solver.dx` or smaller videos",
-        arguments=arguments,
-        advice=advice,
+        lambda: fit(parser.parse_args(arguments), begun), memory=MEMORY, arguments=arguments, advice=after
     )
 
 

@@ -1,4 +1,4 @@
-"""Films from a hand: the camera of each frame, from what stands still in the splat."""
+"""Films from a hand: the camera and the brightness of each frame, from what stands still in the splat."""
 
 from __future__ import annotations
 
@@ -34,6 +34,15 @@ DRAWN, FIRST = 2, 4
 AGREE, MANY = 0.25, 0.2
 """Least share of the points of a frame that agree on its camera, and share of the frames without background above which
 a fit is doubtful."""
+
+BLOCK = 4
+"""Side of the squares over which colours are averaged [pixels], so that edges, noise and compression count little."""
+
+DARK, BRIGHT = 8, 247
+"""Mean grey level up to which a square tells nothing, and that of a pixel from which it may be cut off."""
+
+FEWEST_SQUARES = 50
+"""Fewest squares that make a gain."""
 
 
 class Background:
@@ -243,6 +252,67 @@ def _carried(given: Camera, before: Camera, found: Camera) -> Camera:
     return replace(given, world_to_camera=now @ torch.linalg.inv(then) @ there, intrinsics=found.intrinsics)
 
 
+def gains(video: Footage, background: Background) -> tuple[Tensor, tuple[int, ...]] | None:
+    """Brightness of each frame over that of the splat, by colour.
+
+    Args:
+        video: The film, with the camera of each frame.
+        background: What stands still.
+
+    Returns:
+        Gains of red, green and blue, float64, shape (F, 3), and the frames that show too little of the background,
+        which have those of their neighbours. None if all do.
+    """
+    import numpy as np
+
+    found: list[Tensor | None] = []
+    drawn: tuple[Camera, Tensor, Tensor] | None = None
+    for camera, image in zip(video.cameras, video.images, strict=True):
+        if drawn is None or drawn[0] is not camera:
+            picture, still = background.draw(camera)
+            drawn = (camera, 255 * picture.color.cpu().double(), still)
+        found.append(gain_of(image.double(), *drawn[1:]))
+    known = [k for k, one in enumerate(found) if one is not None]
+    if not known:
+        return None
+    rows = np.stack([one.numpy() for one in found if one is not None])
+    filled = [np.interp(video.times, [video.times[k] for k in known], own) for own in rows.T]
+    return torch.from_numpy(np.stack(filled, 1)), tuple(k for k, one in enumerate(found) if one is None)
+
+
+def gain_of(image: Tensor, picture: Tensor, still: Tensor) -> Tensor | None:
+    """The gain of each colour, float64, shape (3,), between a picture and an image of grey levels up to 255 (H, W, 3).
+
+    It is the median over squares of the mask ``still`` (H, W), weighed by their brightness in the picture, which
+    minimises the sum of distances. None if there are too few squares.
+    """
+    inside = _averaged(still.double()[..., None])[:, 0] == 1
+    seen, wanted = _averaged(image), _averaged(picture)
+    cut = _averaged((torch.maximum(image, picture) >= BRIGHT).double())
+    inside &= ((seen > DARK) & (wanted > DARK) & (cut == 0)).all(1)
+    if int(inside.sum()) < FEWEST_SQUARES:
+        return None
+    found = []
+    for real, drawn in zip(seen[inside].T, wanted[inside].T, strict=True):
+        order = (real / drawn).argsort()
+        total = drawn[order].cumsum(0)
+        found.append((real / drawn)[order[int(torch.searchsorted(total, 0.5 * total[-1]))]])
+    return torch.stack(found)
+
+
+def with_gains(images: Tensor, found: Sequence[Tensor] | Tensor) -> Tensor:
+    """Frames (F, H, W, 3), uint8, divided by their gains (F, 3)."""
+    out = torch.empty_like(images)  # a film may be large: no second list of its frames
+    for one, image, gain in zip(out, images, found, strict=True):
+        one.copy_((image.float() / gain.float()).round().clamp(0, 255))
+    return out
+
+
+def _averaged(picture: Tensor) -> Tensor:
+    """Means over squares of a picture (H, W, C), shape (N, C)."""
+    return torch.nn.functional.avg_pool2d(picture.permute(2, 0, 1)[None], BLOCK)[0].flatten(1).T
+
+
 @dataclass(frozen=True)
 class Judged:
     """The judgement of the background on the film of a camera.
@@ -254,6 +324,7 @@ class Judged:
         hand_held: Whether the camera of each frame was found.
         residual: Median distance of points of the background from where these cameras see them [pixels].
         unseen: Number of frames that show too little of the background; they have the camera of their neighbours.
+        gains: Smallest and largest gain of red, green and blue, shape (2, 3); empty if it is not known.
     """
 
     camera: str
@@ -262,15 +333,21 @@ class Judged:
     hand_held: bool = False
     residual: float = 0.0
     unseen: int = 0
+    gains: tuple[tuple[float, ...], ...] = ()
 
     def sentences(self) -> list[str]:
-        if not self.hand_held:
-            return []
-        return [
-            f"camera {self.camera}: held in a hand; its background goes {self.moved:.3g} pixels. The camera of "
-            f"each frame was found, {self.residual:.2f} pixels off"
-            + (f"; {self.unseen} of {self.frames} frames have that of their neighbours." if self.unseen else ".")
-        ]
+        found = []
+        if self.hand_held:
+            found.append(
+                f"camera {self.camera}: held in a hand; its background goes {self.moved:.3g} pixels. The camera of "
+                f"each frame was found, {self.residual:.2f} pixels off"
+                + (f"; {self.unseen} of {self.frames} frames have that of their neighbours." if self.unseen else ".")
+            )
+        if self.gains:
+            rows = zip(("red", "green", "blue"), *self.gains, strict=True)
+            told = ", ".join(f"{name} {low:.2f} to {high:.2f}" for name, low, high in rows)
+            found.append(f"camera {self.camera}: as bright as the splat now; the frames were divided by {told}.")
+        return found
 
     def doubts(self) -> list[str]:
         if self.unseen <= MANY * self.frames:
@@ -289,7 +366,7 @@ def prepared(
     say: Callable[[str], None] = lambda line: None,
     tick: Callable[[int], object] = lambda frames: None,
 ) -> tuple[list[Footage], list[Judged]]:
-    """Find the camera of each frame of films from a hand.
+    """Find the camera of each frame of films from a hand, and take drifts of exposure and white balance off all films.
 
     Args:
         simulation: The scene.
@@ -312,7 +389,7 @@ def prepared(
             )
         return list(videos), []
     if not hand_held and find_spec("cv2") is None:
-        say("Without OpenCV nothing says whether a camera moves.")
+        say("Without OpenCV nothing says whether a camera moves, or its exposure drifts.")
         return list(videos), []
     found, judged = [], []
     for video in videos:
@@ -323,6 +400,9 @@ def prepared(
             motion = follow_camera(video, background, tick)
             video = replace(video, cameras=motion.cameras)
             one = replace(one, hand_held=True, residual=motion.residual, unseen=len(motion.unseen))
+        if (bright := gains(video, background)) is not None:
+            video = replace(video, images=with_gains(video.images, bright[0]))
+            one = replace(one, gains=tuple(tuple(end.tolist()) for end in (bright[0].amin(0), bright[0].amax(0))))
         for line in one.sentences():
             say(line)
         found.append(video)
