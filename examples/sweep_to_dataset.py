@@ -3,10 +3,10 @@
 import sys
 from pathlib import Path
 
-from torch.utils.data import DataLoader
+import webdataset
 
 from gaussian_swaying.cli.shipped import folder as folder_of_shipped
-from gaussian_swaying.sweeps.dataset import SweepDataset
+from gaussian_swaying.sweeps.dataset import write_shards
 from gaussian_swaying.sweeps.plan import make_plan, read_sweep
 from gaussian_swaying.sweeps.run import run_sweep
 
@@ -32,11 +32,12 @@ def main(
         encoding="utf-8",
     )
     run_sweep(make_plan(read_sweep(plan_file)), folder, workers=workers, together=8, device="cpu", progress=False)
-    data = SweepDataset(folder, frames=True, positions=True)
+    shards = [str(file) for file in write_shards(folder, positions=True)]
+    data = webdataset.WebDataset(shards, shardshuffle=False).decode().to_tuple("parameters.npy", "positions.npy")
     found = []
-    for batch in DataLoader(data, batch_size=3):  # frames (3, T, 3, H, W), positions (3, T, P, 3)
-        aside = (batch["positions"] - batch["positions"][:, :1]).mean((1, 2))[:, 1]
-        found += list(zip(batch["parameters"].tolist(), aside.tolist(), strict=True))
+    for parameters, positions in data.batched(3):  # (3, A), and (3, T, P, 3)
+        aside = (positions - positions[:, :1]).mean((1, 2))[:, 1]
+        found += list(zip(parameters.tolist(), aside.tolist(), strict=True))
     return found
 
 

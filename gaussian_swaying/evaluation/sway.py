@@ -1,9 +1,8 @@
-"""Measures of motion: does a thing sway? And pictures that show motion."""
+"""Measures of motion: does a thing sway?"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -166,56 +165,3 @@ def _together(rest: np.ndarray, lines: np.ndarray, least: float) -> float:
     if len(means) < 2:
         return math.nan
     return float(np.corrcoef(means)[np.triu_indices(len(means), k=1)].mean())
-
-
-# ---- pictures of motion
-
-
-def contact_sheet(frames: Iterable[Array], columns: int) -> np.ndarray:
-    """Frames side by side, row by row.
-
-    Args:
-        frames: Pictures of one size, uint8, each of shape (H, W, 3).
-        columns: Number of frames in a row.
-
-    Returns:
-        The picture, uint8, shape (rows · H, columns · W, 3); places without a frame are black.
-    """
-    film = _film(frames)
-    if columns < 1:
-        raise ValueError(f"Expected `columns` of at least 1, but got {columns}.")
-    count, height, width, _ = film.shape
-    rows = math.ceil(count / columns)
-    places = np.zeros((rows * columns, height, width, 3), dtype=np.uint8)
-    places[:count] = film
-    grid = places.reshape(rows, columns, height, width, 3)
-    return grid.transpose(0, 2, 1, 3, 4).reshape(rows * height, columns * width, 3)
-
-
-def space_time(frames: Iterable[Array], row: int) -> np.ndarray:
-    """A row of pixels over time: what stands still is a straight stripe, what sways a wave.
-
-    Args:
-        frames: T pictures of one size, uint8, each of shape (H, W, 3).
-        row: Row of pixels, whose copies lie one below the other.
-
-    Returns:
-        The picture, uint8, shape (T, W, 3).
-    """
-    film = _film(frames)
-    if not 0 <= row < film.shape[1]:
-        raise ValueError(f"Expected `row` from 0 to {film.shape[1] - 1}, but got {row}.")
-    return film[:, row].copy()
-
-
-def _film(frames: Iterable[Array]) -> np.ndarray:
-    """Frames as one array (T, H, W, 3)."""
-    pictures = [np.asarray(frame.cpu() if isinstance(frame, Tensor) else frame) for frame in frames]
-    if not pictures:
-        raise ValueError("Expected at least one picture in `frames`, but got none.")
-    for picture in pictures:
-        if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape != (*pictures[0].shape[:2], 3):
-            raise ValueError(
-                f"Expected `frames` of uint8 and one shape (H, W, 3), but got {picture.dtype} {picture.shape}."
-            )
-    return np.stack(pictures)

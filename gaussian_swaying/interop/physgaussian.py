@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_frames, check_positive, check_vector
+from gaussian_swaying._checks import check_choice, check_frames, check_positive, check_vector
 from gaussian_swaying._fixed import changed
 from gaussian_swaying._inputs import read_json
 from gaussian_swaying.geometry.frame import SimFrame
@@ -31,49 +31,40 @@ def tidy(vector: Tensor) -> list[float]:
     return [round(v, 12) + 0.0 for v in vector.tolist()]
 
 
-def up_direction(rotation: Tensor) -> list[float]:
-    """The ``scene.up`` with which z up is the z axis of the turned axes, from the rotation of the scene (3, 3)."""
-    return tidy(rotation[2])
-
-
 def heading(rotation: Tensor) -> Tensor:
     """Turned axes to the axes of the simulation, which differ by a rotation about z; shape (3, 3), float64."""
-    return rotation_from_z(up_direction(rotation)).T @ rotation.T
-
-
-class Notes(list[str]):
-    """Sentences on differences, each once."""
-
-    def add(self, sentence: str) -> None:
-        if sentence not in self:
-            self.append(sentence)
+    return rotation_from_z(tidy(rotation[2])).T @ rotation.T
 
 
 class Fields:
-    """The fields of a JSON object; a field that is never read is an error."""
+    """The fields of a JSON object; a field that is never read is an error.
 
-    def __init__(self, fields: Any, where: str) -> None:
+    Args:
+        fields: The object.
+        where: Its name, for messages.
+        notes: Sentences on differences.
+    """
+
+    def __init__(self, fields: Any, where: str, notes: list[str]) -> None:
         if not isinstance(fields, Mapping):
             raise TypeError(f"Expected {where} to be a JSON object, but got {fields!r}.")
-        self._fields, self._where, self._asked = fields, where, set[str]()
-
-    def given(self, name: str) -> bool:
-        return name in self._fields
+        self._fields, self._where, self._asked, self.notes = fields, where, set[str](), notes
 
     def get(self, name: str, *default: Any) -> Any:
         """The value of a key, or the default; ValueError if there is neither."""
         self._asked.add(name)
-        if name in self._fields:
-            return self._fields[name]
-        if not default:
+        if name not in self._fields and not default:
             raise ValueError(f"The key `{name}` of {self._where} is missing.")
-        return default[0]
+        return self._fields.get(name, *default)
+
+    def _typed(self, name: str, kind: Any, what: str, *default: Any) -> Any:
+        value = self.get(name, *default)
+        if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+            raise TypeError(f"Expected `{name}` of {self._where} to be {what}, but got {value!r}.")
+        return value
 
     def number(self, name: str, *default: float) -> float:
-        value = self.get(name, *default)
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise TypeError(f"Expected `{name}` of {self._where} to be a number, but got {value!r}.")
-        return check_vector(name, [value], 1)[0]
+        return check_vector(name, [self._typed(name, (int, float), "a number", *default)], 1)[0]
 
     def positive(self, name: str, *default: float) -> float:
         value = self.number(name, *default)
@@ -89,25 +80,20 @@ class Fields:
             )
         return int(value)
 
-    def flag(self, name: str, default: bool) -> bool:
-        value = self.get(name, default)
-        if not isinstance(value, bool):
-            raise TypeError(f"Expected `{name}` of {self._where} to be true or false, but got {value!r}.")
-        return value
+    def flag(self, name: str) -> bool:
+        return bool(self._typed(name, bool, "true or false", False))
 
-    def list(self, name: str, *default: Any) -> Any:
-        value = self.get(name, *default)
-        if not isinstance(value, (list, tuple)):
-            raise TypeError(f"Expected `{name}` of {self._where} to be a list, but got {value!r}.")
-        return list(value)
-
-    def numbers(self, name: str, *default: Any) -> Any:
-        value = self.list(name, *default)
-        return list(check_vector(name, value, len(value)))
+    def list(self, name: str) -> Any:
+        return list(self._typed(name, (list, tuple), "a list", []))
 
     def vector(self, name: str, *default: Sequence[float], length: int = 3) -> tuple[float, ...]:
         """A list of ``length`` finite numbers."""
         return check_vector(name, self.get(name, *default), length)
+
+    def window(self, required: bool = True) -> dict[str, Any]:
+        """``start`` and ``end`` of a boundary; an end far beyond any run becomes null."""
+        start, end = (self.number(f"{n}_time", *(() if required else (v,))) for n, v in (("start", 0.0), ("end", 1e3)))
+        return {"start": start, "end": None if end >= FOREVER else end}
 
     def finish(self) -> None:
         """Raise ValueError, with a suggestion, if a key was never read."""
@@ -123,76 +109,59 @@ def part(name: str, **arguments: Any) -> dict[str, Any]:
     return {"class_path": name, "init_args": arguments}
 
 
-def box(low: Sequence[float], high: Sequence[float]) -> dict[str, Any]:
+def box(low: Iterable[float], high: Iterable[float]) -> dict[str, Any]:
     """A box between two corners."""
     return part("Box", min=[round(v, 12) for v in low], max=[round(v, 12) for v in high])
 
 
-def box_about(point: Sequence[float], size: Sequence[float]) -> dict[str, Any]:
-    """A box around a point, given half of its sides."""
-    pairs = list(zip(point, size, strict=True))
-    return box([p - s for p, s in pairs], [p + s for p, s in pairs])
+def box_of(take: Fields, *default: Sequence[float]) -> dict[str, Any]:
+    """The box of ``point`` and ``size``, half of its sides."""
+    pairs = list(zip(take.vector("point", *default), take.vector("size", *default), strict=True))
+    return box((p - s for p, s in pairs), (p + s for p, s in pairs))
 
+
+# ---- materials
 
 _YIELD = math.sqrt(1.5)  # from a bound on |dev tau| to the yield stress in uniaxial tension
-
-_MATERIALS = ("jelly", "metal", "sand", "foam", "snow", "plasticine")
-
-_LAW_KEYS = {
-    "yield_stress": ("metal", "foam", "plasticine"),
-    "hardening": ("metal", "plasticine"),
-    "xi": ("metal", "plasticine"),
-    "friction_angle": ("sand",),
-    "plastic_viscosity": ("foam",),
-    "softening": ("plasticine",),
+_FLOW: dict[str, tuple[float, tuple[str, ...]]] = {
+    "yield_stress": (0.0, ("metal", "foam", "plasticine")),
+    "hardening": (0.0, ("metal", "plasticine")),
+    "xi": (0.0, ("metal", "plasticine")),
+    "friction_angle": (25.0, ("sand",)),
+    "plastic_viscosity": (0.0, ("foam",)),
+    "softening": (0.1, ("plasticine",)),
 }
-
-_FLOW_DEFAULTS = {
-    "yield_stress": 0.0,
-    "hardening": 0.0,
-    "xi": 0.0,
-    "friction_angle": 25.0,
-    "plastic_viscosity": 0.0,
-    "softening": 0.1,
-}
+"""Default of each number of a flow, and the materials that it has an effect on."""
 
 
-def material_settings(take: Fields, notes: Notes) -> dict[str, Any]:
+def material_settings(take: Fields) -> dict[str, Any]:
     """``material`` with its regions."""
-    kind = take.get("material", "jelly")
-    if kind not in _MATERIALS:
-        raise ValueError(f"Expected `material` to be one of {', '.join(_MATERIALS)}, but got {kind!r}.")
-    for name, kinds in _LAW_KEYS.items():
-        if take.given(name) and kind not in kinds:
-            notes.add(f"`{name}` has no effect on {kind}.")
-    flow = {name: take.number(name, default) for name, default in _FLOW_DEFAULTS.items()}
-    E, nu = take.positive("E", 1e5), _poisson_ratio(take, 0.4)
-    density = take.positive("density", 200.0)
+    kind, flow = take.get("material", "jelly"), {}
+    check_choice("material", kind, ("jelly", "metal", "sand", "foam", "snow", "plasticine"))
+    for name, (default, kinds) in _FLOW.items():
+        flow[name] = take.number(name, default)
+        if take.get(name, None) is not None and kind not in kinds:
+            take.notes.append(f"`{name}` has no effect on {kind}.")
+    E, nu, density = take.positive("E", 1e5), _poisson_ratio(take, 0.4), take.positive("density", 200.0)
+    law = _law(kind, flow, E, nu, take.notes)
     material: dict[str, Any] = {"E": E, "nu": nu, "density": density, "volume": "cell"}
-    law = _law(kind, flow, E, nu, notes)
-    if law is not None:
-        material["law"] = law
+    material |= {} if law is None else {"law": law}
     regions = []
-    for k, entry in enumerate(take.list("additional_material_params", [])):
-        given = Fields(entry, f"additional_material_params[{k}]")
-        box = box_about(given.vector("point"), given.vector("size"))
-        own_E, own_nu = given.positive("E"), _poisson_ratio(given)
-        region = {"region": box, "E": own_E, "nu": own_nu, "density": given.positive("density", density)}
+    for k, entry in enumerate(take.list("additional_material_params")):
+        given = Fields(entry, f"additional_material_params[{k}]", take.notes)
+        region: dict[str, Any] = {"region": box_of(given), "E": given.positive("E"), "nu": _poisson_ratio(given)}
+        region["density"] = given.positive("density", density)
         given.finish()
-        own = _law(kind, flow, own_E, own_nu, notes)
-        if own != law:
-            region["law"] = own
-        regions.append(region)
-    if regions:
-        material["regions"] = regions
+        own = _law(kind, flow, region["E"], region["nu"], take.notes)
+        regions.append(region if own == law else region | {"law": own})
     if kind == "sand":
-        notes.add(
+        take.notes.append(
             "`material`: PhysGaussian uses the mean volume of all particles for sand; here each cell has its own."
         )
-    return material
+    return material | ({"regions": regions} if regions else {})
 
 
-def _law(kind: str, flow: Mapping[str, float], E: float, nu: float, notes: Notes) -> dict[str, Any] | None:
+def _law(kind: str, flow: Mapping[str, float], E: float, nu: float, notes: list[str]) -> dict[str, Any] | None:
     """``material.law``; None for fixed corotated elasticity.
 
     PhysGaussian bounds ``|dev tau|`` by its yield stress, which grows by ``2 mu xi`` (with ``hardening`` = 1) and falls
@@ -206,13 +175,13 @@ def _law(kind: str, flow: Mapping[str, float], E: float, nu: float, notes: Notes
     if kind == "sand":
         return part("Sand", friction_angle=flow["friction_angle"])
     if kind == "foam":
-        notes.add(
+        notes.append(
             "`plastic_viscosity`: the overstress relaxes exactly here, but by one implicit step in PhysGaussian, where "
             "the shear modulus also grows with the stretch."
         )
         return part("Foam", yield_stress=stress, viscosity=flow["plastic_viscosity"])
     if kind == "snow":
-        notes.add("`material`: PhysGaussian computes no stress for snow; here it is that of Stomakhin et al. 2013.")
+        notes.append("`material`: PhysGaussian computes no stress for snow; here it is that of Stomakhin et al. 2013.")
         return part("Snow")
     if kind == "metal":
         if stress <= 0:
@@ -222,18 +191,18 @@ def _law(kind: str, flow: Mapping[str, float], E: float, nu: float, notes: Notes
             )
         if growth < 0:
             raise ValueError(f"Expected `xi` of metal not to be negative, but got {flow['xi']:g}: use plasticine.")
-        return part("Metal", yield_stress=_YIELD * stress, hardening=1.5 * growth)
-    if stress <= 0:
-        notes.add("`yield_stress`: plasticine with zero never yields in PhysGaussian, so it is elastic here.")
+    elif stress <= 0:
+        notes.append("`yield_stress`: plasticine with zero never yields in PhysGaussian, so it is elastic here.")
         return None
-    notes.add(
-        "`material`: plasticine has Hencky's stress here and the fixed corotated one in PhysGaussian. There a particle "
-        "loses all stress when its yield stress reaches zero; here it keeps its pressure."
-    )
-    growth -= flow["softening"]
-    if growth > 0:
-        return part("Metal", yield_stress=_YIELD * stress, hardening=1.5 * growth)
-    return part("Plasticine", yield_stress=_YIELD * stress, softening=-1.5 * growth)
+    else:
+        notes.append(
+            "`material`: plasticine has Hencky's stress here and the fixed corotated one in PhysGaussian. There a "
+            "particle loses all stress when its yield stress reaches zero; here it keeps its pressure."
+        )
+        growth -= flow["softening"]
+        if growth <= 0:
+            return part("Plasticine", yield_stress=_YIELD * stress, softening=-1.5 * growth)
+    return part("Metal", yield_stress=_YIELD * stress, hardening=1.5 * growth)
 
 
 def _poisson_ratio(take: Fields, *default: float) -> float:
@@ -245,6 +214,8 @@ def _poisson_ratio(take: Fields, *default: float) -> float:
     return nu
 
 
+# ---- boundary conditions
+
 FOREVER = 999.0
 """A condition of PhysGaussian that ends at this time or later has no end here [s]."""
 
@@ -254,76 +225,53 @@ PADDING = 3
 RESET_SUBSTEPS = 15
 """Number of substeps after the end of a cuboid during which ``reset`` keeps all nodes at rest."""
 
-_TYPES = (
-    "bounding_box",
-    "cuboid",
-    "enforce_particle_translation",
-    "enforce_particle_velocity_rotation",
-    "particle_impulse",
-    "release_particles_sequentially",
-    "surface_collider",
-)
-
 _HOLDS = "holds the nodes that its particles touch; PhysGaussian only sets the velocities of the particles."
 
 
 @dataclass(frozen=True)
 class Turned:
-    """Values of the grid that boundaries need: rotation from turned to simulation axes, spacing, side and substep."""
+    """Values that boundaries need.
+
+    Args:
+        turn: Rotation from turned to simulation axes, shape (3, 3).
+        dx: Spacing of the grid.
+        grid_lim: Its side.
+        substep: PhysGaussian's substep [s].
+        sticky: Whether all planes are sticky.
+    """
 
     turn: Tensor
     dx: float
     grid_lim: float
     substep: float
+    sticky: bool
 
     def vector(self, value: Sequence[float]) -> list[float]:
         """A vector of turned axes in the axes of the simulation."""
         return tidy(self.turn @ torch.tensor(value, dtype=torch.float64))
 
 
-def boundary_settings(index: int, entry: Any, space: Turned, sticky: bool, notes: Notes) -> list[dict[str, Any]]:
+def boundary_settings(index: int, entry: Any, space: Turned, notes: list[str]) -> list[dict[str, Any]]:
     """The boundaries for one entry of ``boundary_conditions``."""
     where = f"boundary_conditions[{index}]"
-    take = Fields(entry, where)
-    kind = take.get("type")
-    if kind not in _TYPES:
-        raise ValueError(f"Expected `type` of {where} to be one of {', '.join(_TYPES)}, but got {kind!r}.")
-    take = Fields(entry, f"{where}, a {kind}")
+    kind = Fields(entry, where, notes).get("type")
+    check_choice(f"type` of `{where}", kind, tuple(_BOUNDARIES))
+    take = Fields(entry, f"{where}, a {kind}", notes)
     take.get("type")
-    if kind == "bounding_box":
-        made = _bounding_box(space)
-    elif kind == "cuboid":
-        made = _cuboid(take, space)
-    elif kind == "particle_impulse":
-        made = _impulse(take, space, notes)
-    elif kind == "enforce_particle_translation":
-        made = [_held(box_about(take.vector("point"), take.vector("size")), take, space, notes)]
-    elif kind == "enforce_particle_velocity_rotation":
-        made = [_rotation(take, space, notes)]
-    elif kind == "surface_collider":
-        made = [_plane(take, sticky, notes)]
-    else:
-        made = [_release(take, notes)]
+    made = _BOUNDARIES[kind](take, space)
     take.finish()
-    return made
+    return list(made)
 
 
-def _window(take: Fields, required: bool) -> dict[str, Any]:
-    """``start`` and ``end`` of a boundary; an end far beyond any run becomes null."""
-    start = take.number("start_time", *(() if required else (0.0,)))
-    end = take.number("end_time", *(() if required else (1e3,)))
-    return {"start": start, "end": None if end >= FOREVER else end}
-
-
-def _bounding_box(space: Turned) -> list[dict[str, Any]]:
+def _bounding_box(take: Fields, space: Turned) -> list[dict[str, Any]]:
     # half a cell beyond the last stopped node, since faces exactly on nodes would depend on round-off
     low, high = (PADDING - 0.5) * space.dx, space.grid_lim - (PADDING + 0.5) * space.dx
-    return [part("Wall", shape=part("Box", min=[round(low, 12)] * 3, max=[round(high, 12)] * 3), kind="separate")]
+    return [part("Wall", shape=box([low] * 3, [high] * 3), kind="separate")]
 
 
 def _cuboid(take: Fields, space: Turned) -> list[dict[str, Any]]:
-    region = box_about(take.vector("point"), take.vector("size"))
-    velocity, window = space.vector(take.vector("velocity")), _window(take, required=False)
+    region, velocity = box_of(take), space.vector(take.vector("velocity"))
+    window = take.window(required=False)
     made = [part("VelocityBox", region=region, velocity=velocity, **window)]
     if take.number("reset", 0) == 1:
         rest = {"region": {"class_path": "Everything"}, "velocity": [0.0, 0.0, 0.0]}
@@ -335,26 +283,25 @@ def _cuboid(take: Fields, space: Turned) -> list[dict[str, Any]]:
     return made
 
 
-def _impulse(take: Fields, space: Turned, notes: Notes) -> list[dict[str, Any]]:
-    force = space.vector(take.vector("force"))
+def _impulse(take: Fields, space: Turned) -> list[dict[str, Any]]:
     start, seconds = take.number("start_time", 0.0), take.whole("num_dt", 1) * space.substep
-    region = box_about(take.vector("point", CENTER), take.vector("size", CENTER))
-    notes.add(
+    take.notes.append(
         "`particle_impulse`: the total momentum is the same, but it is spread by mass; PhysGaussian gives each "
         "particle the same share, whatever its mass."
     )
-    impulse = [round(f * seconds, 18) + 0.0 for f in force]
+    impulse = [round(f * seconds, 18) + 0.0 for f in space.vector(take.vector("force"))]
+    region = box_of(take, CENTER)
     return [part("Impulse", region=region, impulse=impulse, start=start, end=start + seconds, per_particle=True)]
 
 
-def _held(region: dict[str, Any], take: Fields, space: Turned, notes: Notes) -> dict[str, Any]:
-    velocity, window = space.vector(take.vector("velocity")), _window(take, required=True)
-    notes.add(f"`enforce_particle_translation`: {_HOLDS}")
+def _translation(take: Fields, space: Turned) -> list[dict[str, Any]]:
+    velocity = space.vector(take.vector("velocity"))
+    take.notes.append(f"`enforce_particle_translation`: {_HOLDS}")
     moved = {"velocity": velocity} if any(velocity) else {}
-    return part("PinnedRegion", region=region, kind="nodes", **moved, **window)
+    return [part("PinnedRegion", region=box_of(take), kind="nodes", **moved, **take.window())]
 
 
-def _rotation(take: Fields, space: Turned, notes: Notes) -> dict[str, Any]:
+def _rotation(take: Fields, space: Turned) -> list[dict[str, Any]]:
     point, normal = take.vector("point"), take.vector("normal")
     length = math.hypot(*normal)
     if length == 0:
@@ -363,22 +310,15 @@ def _rotation(take: Fields, space: Turned, notes: Notes) -> dict[str, Any]:
     half_height, radius = take.vector("half_height_and_radius", length=2)
     region = part("Cylinder", center=list(point), axis=list(normal), radius=radius, height=2 * half_height)
     rate, speed = take.number("rotation_scale"), take.number("translation_scale")
-    window = _window(take, required=True)
-    notes.add(f"`enforce_particle_velocity_rotation`: {_HOLDS}")
-    if rate == 0 and speed == 0:
-        return part("PinnedRegion", region=region, kind="nodes", **window)
-    return part(
-        "PinnedRegion",
-        region=region,
-        velocity=space.vector([speed * c for c in normal]),
-        angular_velocity=space.vector([-rate * c for c in normal]),  # PhysGaussian turns clockwise about its normal
-        pivot=list(point),
-        kind="nodes",
-        **window,
-    )
+    take.notes.append(f"`enforce_particle_velocity_rotation`: {_HOLDS}")
+    moved: dict[str, Any] = {}
+    if rate or speed:  # PhysGaussian turns clockwise about its normal
+        moved = {"velocity": space.vector([speed * c for c in normal])}
+        moved |= {"angular_velocity": space.vector([-rate * c for c in normal]), "pivot": list(point)}
+    return [part("PinnedRegion", region=region, kind="nodes", **moved, **take.window())]
 
 
-def _plane(take: Fields, sticky: bool, notes: Notes) -> dict[str, Any]:
+def _plane(take: Fields, space: Turned) -> list[dict[str, Any]]:
     point, normal = take.vector("point"), take.vector("normal")
     surface, friction = take.get("surface"), take.number("friction")
     if not isinstance(surface, str):
@@ -392,17 +332,19 @@ def _plane(take: Fields, sticky: bool, notes: Notes) -> dict[str, Any]:
         raise ValueError(f"Expected `friction` of a sticky surface_collider to be 0, but got {friction:g}.")
     kind = surface if surface in ("sticky", "slip", "separate") else "separate"
     if kind != surface:
-        notes.add(f"`surface` {surface!r} becomes separate, as in PhysGaussian, which treats unknown names like that.")
-    if sticky and kind != "sticky":
+        take.notes.append(
+            f"`surface` {surface!r} becomes separate, as in PhysGaussian, which treats unknown names like that."
+        )
+    if space.sticky and kind != "sticky":
         kind, friction = "sticky", 0.0
-        notes.add(f"`surface`: the {surface} plane is sticky, as in PhysGaussian's code.")
+        take.notes.append(f"`surface`: the {surface} plane is sticky, as in PhysGaussian's code.")
     elif kind != "sticky":
-        notes.add(f"`surface`: the plane is {kind} here; PhysGaussian's code makes every plane sticky.")
+        take.notes.append(f"`surface`: the plane is {kind} here; PhysGaussian's code makes every plane sticky.")
     shape = part("HalfSpace", point=list(point), normal=list(normal))
-    return part("Wall", shape=shape, kind=kind, friction=friction, **_window(take, True))
+    return [part("Wall", shape=shape, kind=kind, friction=friction, **take.window())]
 
 
-def _release(take: Fields, notes: Notes) -> dict[str, Any]:
+def _release(take: Fields, space: Turned) -> list[dict[str, Any]]:
     normal = take.vector("normal")
     axes = [axis for axis, component in enumerate(normal) if component != 0]
     if len(axes) != 1:
@@ -410,7 +352,6 @@ def _release(take: Fields, notes: Notes) -> dict[str, Any]:
             "Expected `normal` of a release_particles_sequentially to be along one axis, as PhysGaussian supports no "
             f"other, but got {list(normal)}."
         )
-    axis = axes[0]
     first, last = take.number("start_position"), take.number("end_position")
     if first == last:
         raise ValueError(f"Expected `start_position` and `end_position` to differ, but both are {first:g}.")
@@ -421,14 +362,31 @@ def _release(take: Fields, notes: Notes) -> dict[str, Any]:
             "before anything is held is not supported."
         )
     take.whole("num_layers")
-    notes.add(
+    take.notes.append(
         "`release_particles_sequentially`: a continuous front between the two positions. PhysGaussian has 50 "
         f"layers, whatever `num_layers` says, and as many mirrored beyond `end_position`. Here it {_HOLDS}"
     )
-    low, high = [0.0] * 3, [2.0] * 3
-    low[axis], high[axis] = min(first, last), max(first, last)
-    ends = [[v if k == axis else 1.0 for k in range(3)] for v in (first, last)]
-    return part("PinnedRegion", region=box(low, high), kind="nodes", front=ends, start=0.0, end=end)
+
+    def at(value: float, rest: float) -> list[float]:
+        return [value if axis == axes[0] else rest for axis in range(3)]
+
+    region = box(at(min(first, last), 0.0), at(max(first, last), 2.0))
+    front = [at(first, 1.0), at(last, 1.0)]
+    return [part("PinnedRegion", region=region, kind="nodes", front=front, start=0.0, end=end)]
+
+
+_BOUNDARIES = {
+    "bounding_box": _bounding_box,
+    "cuboid": _cuboid,
+    "enforce_particle_translation": _translation,
+    "enforce_particle_velocity_rotation": _rotation,
+    "particle_impulse": _impulse,
+    "release_particles_sequentially": _release,
+    "surface_collider": _plane,
+}
+
+
+# ---- cameras
 
 
 @dataclass(eq=False)
@@ -549,6 +507,9 @@ def read_model_camera(path: str | os.PathLike[str], index: int, near: float = 0.
     return Camera(torch.linalg.inv(pose), torch.tensor(rows, dtype=torch.float64), width, height, near)
 
 
+# ---- the whole configuration
+
+
 def read_config(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Read a PhysGaussian configuration; ValueError if it is missing or not a JSON object."""
     config = read_json(path, "PhysGaussian configuration")
@@ -573,50 +534,43 @@ def convert(
     Returns:
         The settings, without a splat (``scene.ply`` must be set), and sentences about everything whose meaning differs.
     """
-    take, notes = Fields(config, "PhysGaussian's configuration"), Notes()
-    degrees = take.numbers("rotation_degree", [])
-    axes = take.list("rotation_axis", [])
+    notes: list[str] = []
+    take = Fields(config, "PhysGaussian's configuration", notes)
+    degrees, axes = take.list("rotation_degree"), take.list("rotation_axis")
+    degrees = list(check_vector("rotation_degree", degrees, len(degrees)))
     rotation, scale = rotation_matrix(degrees, axes), take.positive("scale", 1.0)
-    turn = heading(rotation)
-
-    grid_lim, n_grid = take.positive("grid_lim", 2.0), take.whole("n_grid", 50)
-    dx = grid_lim / n_grid
+    turn, grid_lim, n_grid = heading(rotation), take.positive("grid_lim", 2.0), take.whole("n_grid", 50)
     substep, frame_dt = take.positive("substep_dt", 1e-4), take.positive("frame_dt", 1e-2)
     frames = check_frames("frame_num", take.whole("frame_num", 100))
-    notes.add(
+    notes.append(
         f"`substep_dt`: the substep is adaptive instead of {substep:g} s, which is only used for damping and impulses; "
         f"--solver.substep {substep:g} fixes it, and is refused unless it is stable."
     )
-
-    scene: dict[str, Any] = {
-        "ply": None,
-        "up": up_direction(rotation),
-        "opacity_threshold": take.number("opacity_threshold", 0.02),
-        "faint": "drop",
-    }
-    area = take.get("sim_area", None)
+    scene: dict[str, Any] = {"ply": None, "up": tidy(rotation[2])}  # with which z up is the z axis of the turned axes
+    scene |= {"opacity_threshold": take.number("opacity_threshold", 0.02), "faint": "drop"}
+    area, filling = take.get("sim_area", None), take.get("particle_filling", None)
     if area is not None:
         bounds = check_vector("sim_area", area, 6)
         scene["region"] = box(bounds[0::2], bounds[1::2])
-    filling = take.get("particle_filling", None)
     if filling is not None:
-        scene["filling"] = filling_settings(filling, n_grid, grid_lim, notes)
-
-    material = material_settings(take, notes)
-    solver: dict[str, Any] = {
-        "formulation": "updated",
-        "dx": dx,
-        "gravity": _gravity(take, turn),
-        "damping": _damping(take, substep, notes),
-    }
-    entries = take.list("boundary_conditions", [])
-    solver["boundaries"] = [
-        made
-        for k, entry in enumerate(entries)
-        for made in boundary_settings(k, entry, Turned(turn, dx, grid_lim, substep), sticky_planes, notes)
-    ]
-    camera = camera_settings(take, cameras, notes)
+        scene["filling"] = filling_settings(Fields(filling, "particle_filling", notes), n_grid, grid_lim)
+    material = material_settings(take)
+    space = Turned(turn, grid_lim / n_grid, grid_lim, substep, sticky_planes)
+    gravity = take.get("g", 9.8)
+    if not isinstance(gravity, (list, tuple)):
+        raise ValueError(
+            f"Expected `g` to be a list of 3 numbers, for example [0, 0, -9.8], but got {gravity!r}; PhysGaussian's "
+            "default, a single number, does not work there either."
+        )
+    solver: dict[str, Any] = {"formulation": "updated", "dx": space.dx}
+    solver |= {"gravity": space.vector(check_vector("g", gravity)), "damping": _damping(take, substep)}
+    entries = enumerate(take.list("boundary_conditions"))
+    solver["boundaries"] = [made for k, entry in entries for made in boundary_settings(k, entry, space, notes)]
+    camera = camera_settings(take, cameras)
     take.finish()
+    notes.append(
+        "PhysGaussian has no wind: the coefficients of `aero` are zero; for wind set `wind.flow` and C_D, C_F and C_L."
+    )
     settings = {
         "frames": frames + 1,
         "frame_dt": frame_dt,
@@ -628,34 +582,19 @@ def convert(
         "aero": {"C_D": 0.0, "C_F": 0.0, "C_L": 0.0},
         "camera": camera,
     }
-    notes.add(
-        "PhysGaussian has no wind: the coefficients of `aero` are zero; for wind set `wind.flow` and C_D, C_F and C_L."
-    )
-    return settings, notes
+    return settings, list(dict.fromkeys(notes))
 
 
-def _gravity(take: Fields, turn: Tensor) -> list[float]:
-    """``solver.gravity`` [m/s²]."""
-    value = take.get("g", 9.8)
-    if not isinstance(value, (list, tuple)):
-        raise ValueError(
-            f"Expected `g` to be a list of 3 numbers, for example [0, 0, -9.8], but got {value!r}; PhysGaussian's "
-            "default, a single number, does not work there either."
-        )
-    return tidy(turn @ torch.tensor(check_vector("g", value), dtype=torch.float64))
-
-
-def _damping(take: Fields, substep: float, notes: Notes) -> float:
+def _damping(take: Fields, substep: float) -> float:
     """Decay rate [1/s] of the factor by which velocities are multiplied every substep."""
-    rpic = take.number("rpic_damping", 0.0)
+    rpic, pic = take.number("rpic_damping", 0.0), take.number("pic_damping", 0.0)
     if rpic != 0:
-        notes.add(
+        take.notes.append(
             f"`rpic_damping` {rpic:g} is not supported: the transfer is APIC; for damping use --solver.damping and "
             "--solver.stiffness_damping."
         )
-    if take.given("pic_damping"):
-        take.number("pic_damping")
-        notes.add("`pic_damping` has no effect in PhysGaussian or here.")
+    if pic != 0:
+        take.notes.append("`pic_damping` has no effect in PhysGaussian or here.")
     factor = take.positive("grid_v_damping_scale", 1.1)
     return 0.0 if factor >= 1 else -math.log(factor) / substep
 
@@ -672,65 +611,50 @@ _FILLING_NOTES = {
 }
 
 
-def filling_settings(fields: Any, n_grid: int, grid_lim: float, notes: Notes) -> dict[str, Any]:
+def filling_settings(take: Fields, n_grid: int, grid_lim: float) -> dict[str, Any]:
     """``scene.filling``: another method for the same purpose, on a grid with the same spacing."""
-    take = Fields(fields, "particle_filling")
     spacing = grid_lim / take.whole("n_grid", 4 * n_grid)
     wanted = take.whole("max_partciels_per_cell", 1)
     count = next((n for n in (1, 8) if wanted <= n), 27)
     if count != wanted:
-        notes.add(f"`particle_filling.max_partciels_per_cell` {wanted} becomes {count}, as a cell has 1, 8 or 27.")
+        take.notes.append(f"`particle_filling.max_partciels_per_cell` {wanted} becomes {count}: a cell has 1, 8 or 27.")
     for name, sentence in _FILLING_NOTES.items():
-        value = take.get(name, None)
-        if value is not None and value is not False:
-            notes.add(f"`particle_filling.{name}` {sentence}")
+        if take.get(name, None) not in (None, False):
+            take.notes.append(f"`particle_filling.{name}` {sentence}")
     take.finish()
     return {"spacing": spacing, "particles_per_cell": count}
 
 
-def camera_settings(take: Fields, cameras: str | None, notes: Notes) -> dict[str, Any]:
+def camera_settings(take: Fields, cameras: str | None) -> dict[str, Any]:
     """``camera``: a camera of the model, the moving camera, or our orbit camera if the file of cameras is missing."""
-    viewpoint = list(take.vector("mpm_space_viewpoint_center", CENTER))
-    up = list(take.vector("mpm_space_vertical_upward_axis", (0.0, 0.0, 1.0)))
-    index = take.whole("default_camera_index", 0, least=-1)
-    names = ("init_azimuthm", "init_elevation", "init_radius")
-    start = {name: take.get(name, None) for name in names}
-    deltas = {name: take.get(name, None) for name in ("delta_a", "delta_e", "delta_r")}
-    moves = take.flag("move_camera", False)
-    if take.flag("show_hint", False):
-        notes.add("`show_hint` has no effect: PhysGaussian prints the camera's angles and stops.")
+    seen = {"viewpoint": list(take.vector("mpm_space_viewpoint_center", CENTER))}
+    seen["up"] = list(take.vector("mpm_space_vertical_upward_axis", (0.0, 0.0, 1.0)))
+    index, moves = take.whole("default_camera_index", 0, least=-1), take.flag("move_camera")
+    keys = {"azimuth": "init_azimuthm", "elevation": "init_elevation", "radius": "init_radius"}
+    deltas = {"delta_azimuth": "delta_a", "delta_elevation": "delta_e", "delta_radius": "delta_r"}
+    given = {name: take.get(key, None) for name, key in (keys | deltas).items()}
+    if take.flag("show_hint"):
+        take.notes.append("`show_hint` has no effect: PhysGaussian prints the camera's angles and stops.")
     orbit = "gaussian_swaying.interop.physgaussian.PhysGaussianCamera"
     if index >= 0 and cameras is None:
-        notes.add(
+        take.notes.append(
             f"`default_camera_index` {index} is a camera of the 3DGS model, whose cameras.json was not given, so it is "
             f"an orbit here; --camera {orbit} --camera.cameras PATH --camera.index {index} uses the model's."
         )
         return part("OrbitCamera", width=960, height=540)
     if index >= 0:
         return part(orbit, cameras=cameras, index=index)
-    wanted = [*start, *deltas] if moves else list(start)
-    for name in wanted:
-        if (start | deltas)[name] is None:
-            raise ValueError(f"The key `{name}` is missing, but `default_camera_index` -1 needs it.")
-        take.number(name)
+    for name, key in (keys | deltas if moves else keys).items():
+        if given[name] is None:
+            raise ValueError(f"The key `{key}` is missing, but `default_camera_index` -1 needs it.")
+        given[name] = take.number(key)
     if cameras is None:
-        notes.add(
+        take.notes.append(
             "`default_camera_index` -1: PhysGaussian takes lens and size of the picture from the model's cameras.json; "
             "here they are those of `camera`."
         )
-    change = [float(d) for d in deltas.values()] if moves else [0.0] * 3
-    return part(
-        orbit,
-        cameras=cameras,
-        azimuth=float(start["init_azimuthm"]),
-        elevation=float(start["init_elevation"]),
-        radius=float(start["init_radius"]),
-        delta_azimuth=change[0],
-        delta_elevation=change[1],
-        delta_radius=change[2],
-        viewpoint=viewpoint,
-        up=up,
-    )
+    still = {} if moves else dict.fromkeys(deltas, 0.0)
+    return part(orbit, cameras=cameras, **given | still, **seen)
 
 
 def to_yaml(settings: Mapping[str, Any], notes: Iterable[str] = (), source: str | None = None) -> str:

@@ -345,9 +345,10 @@ def _end_with_parent() -> None:
     parent = os.getppid()
 
     def watch() -> None:
-        while os.getppid() == parent:
+        while True:  # the first signal ends a run at a frame, the next one a process without a run
             time.sleep(1.0)
-        os.kill(os.getpid(), signal.SIGTERM)
+            if os.getppid() != parent:
+                os.kill(os.getpid(), signal.SIGTERM)
 
     threading.Thread(target=watch, daemon=True).start()
 

@@ -27,7 +27,7 @@ from gaussian_swaying.training.densification import PARAMETERS, DefaultDensifica
 from gaussian_swaying.training.initial import gaussians_from_file
 from gaussian_swaying.training.losses import LossInputs, LossTerm, OtherView, TotalLoss
 from gaussian_swaying.training.optimizers import GaussianAdam, LearningRates, means_rate
-from gaussian_swaying.training.panels import lpips_metric, panel, picture_metrics, write_panel
+from gaussian_swaying.training.panels import panel, picture_metrics, write_panel
 from gaussian_swaying.training.parallel import share_gradients, steps_of
 from gaussian_swaying.training.surface_losses import SurfaceTerm as SurfaceTerm  # so that a YAML finds its terms
 
@@ -87,7 +87,6 @@ class SplatTrainer(lightning.LightningModule):
         log_every: Steps between logged values.
         packed: Keep values of the Gaussians in the picture alone: less memory on a GPU, one more wait.
         init_ply: Splat with the initial Gaussians.
-        lpips: Backbone of the LPIPS metric, used only if its weights are on disk; null for none.
 
     Attributes:
         renderer: The renderer; None for that of :func:`~gaussian_swaying.rendering.gsplat_renderer.make_renderer`.
@@ -113,7 +112,6 @@ class SplatTrainer(lightning.LightningModule):
         log_every: int = 50,
         packed: bool = False,
         init_ply: str | None = None,
-        lpips: Literal["alex", "vgg", "squeeze"] | None = "alex",
     ) -> None:
         super().__init__()
         if sh_degree not in (0, 1, 2, 3):
@@ -139,8 +137,6 @@ class SplatTrainer(lightning.LightningModule):
         self.seed, self.panels, self.log_every = seed, panels, log_every
         self.packed, self.init_ply = packed, init_ply
         self.model: GaussianSurfaceModel | None = None
-        self._lpips_net = lpips
-        self._lpips: list[Any] = []  # in a list, so that its weights are not stored in checkpoints
         self.renderer = None
         self._made: dict[str, SplatRenderer] = {}  # by kind of device: Lightning moves the model after a fit
         self._fitting = False
@@ -424,11 +420,7 @@ class SplatTrainer(lightning.LightningModule):
         images = self.global_step * self.devices if self._fitting else self._seen
         degree = self.active_degree(max(images - 1, 0)) if self._fitting else self._degree_reached()
         image = self.render(batch["camera"], background, degree).color.clamp(0.0, 1.0)
-        if self._lpips_net is not None:
-            metric, self._lpips_net = lpips_metric(self._lpips_net), None
-            self._lpips = [] if metric is None else [metric]
-        lpips = self._lpips[0].to(self.device) if self._lpips else None
-        for name, value in picture_metrics(image, target, lpips).items():
+        for name, value in picture_metrics(image, target).items():
             self.log(f"{stage}/{name}", value, prog_bar=name == "psnr", batch_size=1)
         self.log(f"{stage}/gaussians", float(len(self.splat)), batch_size=1)
         if batch_idx < self.panels and not self.trainer.sanity_checking and self.trainer.is_global_zero:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -11,17 +10,11 @@ import torch
 from einops import rearrange
 from torch import Tensor
 
-from gaussian_swaying._checks import check_choice
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.metrics.ssim import SSIM_TAPS
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.passes import colormap
 from gaussian_swaying.rendering.protocol import Renderer
-
-# the files that torchvision would download
-_BACKBONES = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth", "squeeze": "squeezenet1_1-b8a52dc0.pth"}
-LPIPS_SIDE = 32
-"""Fewest pixels on a side that the backbones of LPIPS take."""
 
 
 @torch.no_grad()
@@ -74,13 +67,12 @@ def write_panel(pictures: Tensor, folder: Path, name: str, step: int, loggers: I
             board.add_image(name, pixels.numpy(), step, dataformats="HWC")
 
 
-def picture_metrics(image: Tensor, target: Tensor, lpips: Any | None = None) -> dict[str, Tensor]:
-    """PSNR [dB], and SSIM and LPIPS where a picture is large enough for them.
+def picture_metrics(image: Tensor, target: Tensor) -> dict[str, Tensor]:
+    """PSNR [dB], and SSIM where a picture is large enough for it.
 
     Args:
         image: Picture from 0 to 1, shape (H, W, 3).
         target: Photo, of the same shape.
-        lpips: The metric of :func:`lpips_metric`; None to leave it out.
     """
     from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
@@ -90,25 +82,4 @@ def picture_metrics(image: Tensor, target: Tensor, lpips: Any | None = None) -> 
         ssim = structural_similarity_index_measure(one, two, data_range=1.0)
         assert isinstance(ssim, Tensor)
         values["ssim"] = ssim
-    if lpips is not None and min(image.shape[:2]) >= LPIPS_SIDE:
-        values["lpips"] = lpips(one, two)
     return values
-
-
-def lpips_metric(net: str = "alex") -> Any | None:
-    """The LPIPS metric (Zhang et al. 2018) of torchmetrics, if all that it needs is on this machine.
-
-    Args:
-        net: Backbone: ``alex``, ``vgg`` or ``squeeze``.
-
-    Returns:
-        The metric for pictures from 0 to 1, or None without torchvision or without the weights of the backbone in
-        torch's folder of checkpoints. Nothing is downloaded.
-    """
-    check_choice("net", net, tuple(_BACKBONES))
-    folder = Path(torch.hub.get_dir()) / "checkpoints"
-    if importlib.util.find_spec("torchvision") is None or not (folder / _BACKBONES[net]).is_file():
-        return None
-    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
-
-    return LearnedPerceptualImagePatchSimilarity(net_type=net, normalize=True)  # type: ignore[arg-type]

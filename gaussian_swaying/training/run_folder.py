@@ -16,8 +16,9 @@ from gaussian_swaying.runs.lock import FolderLock
 
 
 def default_loggers(folder: Path) -> list[Logger]:
-    """A CSV file and, if tensorboard is installed, its event files, all in ``folder``."""
-    loggers: list[Logger] = [CSVLogger(folder, "csv", flush_logs_every_n_steps=1)]
+    """A CSV file, beside one that is there, and, if tensorboard is installed, its event files, all in ``folder``."""
+    version = None if (folder / "csv/metrics.csv").exists() else ""
+    loggers: list[Logger] = [CSVLogger(folder, "csv", version, flush_logs_every_n_steps=1)]
     if any(importlib.util.find_spec(name) is not None for name in ("tensorboard", "tensorboardX")):
         loggers.append(TensorBoardLogger(folder, "tensorboard"))
     return loggers

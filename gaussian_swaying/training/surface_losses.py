@@ -6,6 +6,8 @@ views tell where the surface is: a point of it must look the same from both (Che
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -235,18 +237,14 @@ class DepthNormalLoss(SurfaceTerm):
     Args:
         start: See :class:`SurfaceTerm`.
         edges: Weigh pixels by :func:`edge_weight`.
-        stop: See :class:`SurfaceTerm`.
-        fade: See :class:`SurfaceTerm`.
-        every: See :class:`SurfaceTerm`.
+        when: Further arguments of :class:`SurfaceTerm`.
 
     Raises:
         ValueError: If a number is out of range.
     """
 
-    def __init__(
-        self, start: int = 7000, edges: bool = True, stop: int | None = None, fade: int = 0, every: int = 1
-    ) -> None:
-        super().__init__(start, stop, fade, every)
+    def __init__(self, start: int = 7000, edges: bool = True, **when: Any) -> None:
+        super().__init__(start, **when)
         self.edges = bool(edges)
 
     def forward(self, inputs: LossInputs) -> Tensor:
@@ -265,9 +263,7 @@ class MultiViewGeometricLoss(SurfaceTerm):
         start: See :class:`SurfaceTerm`.
         samples: Pixels of an image that are tried.
         farthest: Longest distance that counts [pixels].
-        stop: See :class:`SurfaceTerm`.
-        fade: See :class:`SurfaceTerm`.
-        every: See :class:`SurfaceTerm`.
+        when: Further arguments of :class:`SurfaceTerm`.
 
     Raises:
         ValueError: If a number is out of range.
@@ -275,16 +271,8 @@ class MultiViewGeometricLoss(SurfaceTerm):
 
     needs = frozenset({"surface", "other_view"})
 
-    def __init__(
-        self,
-        start: int = 7000,
-        samples: int = 102_400,
-        farthest: float = 1.0,
-        stop: int | None = None,
-        fade: int = 0,
-        every: int = 1,
-    ) -> None:
-        super().__init__(start, stop, fade, every)
+    def __init__(self, start: int = 7000, samples: int = 102_400, farthest: float = 1.0, **when: Any) -> None:
+        super().__init__(start, **when)
         check_positive("samples", samples)
         check_positive("farthest", farthest)
         self.samples, self.farthest = int(samples), float(farthest)
@@ -316,9 +304,7 @@ class MultiViewPhotometricLoss(SurfaceTerm):
         farthest: Longest round trip of a patch that counts [pixels].
         contrast: Least standard deviation of the grey values (0 to 1) in a patch that counts. Where a surface has one
             colour, a patch is noise.
-        stop: See :class:`SurfaceTerm`.
-        fade: See :class:`SurfaceTerm`.
-        every: See :class:`SurfaceTerm`.
+        when: Further arguments of :class:`SurfaceTerm`.
 
     Raises:
         ValueError: If a number is out of range.
@@ -333,11 +319,9 @@ class MultiViewPhotometricLoss(SurfaceTerm):
         radius: int = 3,
         farthest: float = 1.0,
         contrast: float = 0.01,
-        stop: int | None = None,
-        fade: int = 0,
-        every: int = 1,
+        **when: Any,
     ) -> None:
-        super().__init__(start, stop, fade, every)
+        super().__init__(start, **when)
         for name, value in (("samples", samples), ("radius", radius), ("farthest", farthest), ("contrast", contrast)):
             check_positive(name, value)
         self.samples, self.radius, self.farthest = int(samples), int(radius), float(farthest)

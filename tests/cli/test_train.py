@@ -88,8 +88,8 @@ def test_a_second_run_in_the_same_folder_keeps_its_own_last_state(capture, tmp_p
     assert len(last["state_dict"]["model.means"]) == 500
 
 
-def _rows(folder, version=0):
-    return rows(folder / f"csv/version_{version}/metrics.csv")
+def _rows(folder, version="."):
+    return rows(folder / "csv" / version / "metrics.csv")
 
 
 @pytest.fixture
@@ -140,7 +140,7 @@ def test_a_training_that_ends_early_names_its_checkpoint(error, code, told, capt
     assert not [path for path in folder.rglob(".*")]
     again = shlex.split(said.splitlines()[-1])[2:]
     assert main(again) == 0
-    assert [row["step"] for row in _rows(folder, 1) if row["train/loss"]] == ["13", "16"]
+    assert [row["step"] for row in _rows(folder, "version_0") if row["train/loss"]] == ["13", "16"]
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
@@ -182,7 +182,7 @@ def test_a_refused_training_changes_nothing(capture, tmp_path, capsys):
     assert main(["validate", *_arguments(capture, folder), f"--ckpt_path={last}"]) == 0
     assert f"wrote {folder}/csv\n" in capsys.readouterr().out
     assert {path: content for path, content in contents(tmp_path).items() if path in before} == before
-    assert float(_rows(folder, 1)[-1]["val/psnr"]) > 0
+    assert float(_rows(folder, "version_0")[-1]["val/psnr"]) > 0
 
 
 def test_a_second_training_moves_the_first_aside(capture, tmp_path, capsys):

@@ -1,17 +1,19 @@
 """The table as Parquet, and the runs as WebDataset shards, read back."""
 
-import io
 import json
+import shutil
 import tarfile
 
 import numpy as np
 import pytest
 from PIL import Image
-from shared import rows
+from shared import rows, value_error
 
 from gaussian_swaying.cli.sweep import main
+from gaussian_swaying.recording.nodes import load_nodes
+from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.sweeps import record
-from gaussian_swaying.sweeps.dataset import SweepDataset, write_shards
+from gaussian_swaying.sweeps.dataset import write_shards
 from gaussian_swaying.sweeps.plan import Plan
 from gaussian_swaying.sweeps.record import write_tables
 
@@ -46,41 +48,79 @@ def test_the_parquet_of_a_sweep(undisturbed, tmp_path, sweep_file):
     (undisturbed / "sweep.parquet").unlink()
 
 
+def _read(files):
+    import webdataset
+
+    return list(webdataset.WebDataset([str(file) for file in files], shardshuffle=False).decode("rgb8"))
+
+
 def test_shards(undisturbed, tmp_path):
-    webdataset = pytest.importorskip("webdataset")
-    files = write_shards(undisturbed, 3, tmp_path / "shards", positions=True)
+    pytest.importorskip("webdataset")
+    files = write_shards(undisturbed, 3, tmp_path / "shards", positions=True, nodes=True)
     assert [file.name for file in files] == ["000000.tar", "000001.tar", "000002.tar"]
-    data, seen = SweepDataset(undisturbed, positions=True), []
-    for file in files:
-        with tarfile.open(file) as tar:
-            names = tar.getnames()
-            keys = [name.partition(".")[0] for name in names]
-            assert keys == sorted(keys)  # what belongs together follows each other
-            for run in dict.fromkeys(keys):
-                item = data[len(seen)]
-                seen.append(run)
-                told = json.load(tar.extractfile(f"{run}.json"))
-                assert told["run"] == run
-                assert told["settings"] == data.settings[len(seen) - 1]
-                stored = np.load(io.BytesIO(tar.extractfile(f"{run}.positions.npy").read()))
-                assert np.array_equal(stored, item["positions"].numpy())
-                stored = np.load(io.BytesIO(tar.extractfile(f"{run}.parameters.npy").read()))
-                assert np.array_equal(stored, item["parameters"].numpy())
-                with Image.open(tar.extractfile(f"{run}.00011.png")) as picture:
-                    shown = np.asarray(picture.convert("RGB")).transpose(2, 0, 1)
-                assert np.array_equal(shown, item["frames"][11].numpy())
-                assert sum(name.startswith(run) and name.endswith(".png") for name in names) == 12
-    assert seen == data.runs
-    again = write_shards(undisturbed, 3, tmp_path / "again", positions=True)
+    samples = _read(files)
+    assert [sample["__key__"] for sample in samples] == [f"{number:05d}" for number in range(8)]
+    item, place = samples[6], undisturbed / "runs/00006"
+    summary, told = json.loads((place / "summary.json").read_text()), item["json"]
+    assert told["run"] == "00006"
+    assert told["settings"] == json.loads((undisturbed / "sweep.json").read_text())["runs"][6]
+    assert told["parameter_names"] == ["wind.flow.0", "wind.flow.1", "wind.flow.2", "material.E", "wind.seed"]
+    assert item["parameters.npy"].tolist() == [8.0, 2.0, 0.0, 3e4, summary["seed"]]
+    assert item["parameters.npy"].dtype == np.float64
+    assert told["summary"]["wind_work_J"] == summary["wind_work_J"]
+    assert told["summary"]["frames"] == 12
+    with Image.open(place / "frames/00007.png") as image:
+        assert np.array_equal(item["00007.png"], np.asarray(image.convert("RGB")))
+    assert sum(name.endswith(".png") for name in item) == 12
+    assert np.array_equal(item["positions.npy"][11], load_trajectory(place / "trajectory.npz", 11)[0].numpy())
+    assert np.array_equal(item["nodes.npy"], load_nodes(place / "nodes.npz").numpy())
+    again = write_shards(undisturbed, 3, tmp_path / "again", positions=True, nodes=True)
     assert [a.read_bytes() for a in files] == [b.read_bytes() for b in again]
     (larger,) = write_shards(undisturbed, 100, tmp_path / "shards", frames=False)
     assert [file.name for file in (tmp_path / "shards").iterdir()] == [larger.name]
-    read = webdataset.WebDataset(str(tmp_path / "again/{000000..000002}.tar"), shardshuffle=False).decode("rgb8")
-    samples = list(read)
-    assert [sample["__key__"] for sample in samples] == data.runs
-    assert samples[0]["positions.npy"].shape == data[0]["positions"].shape
-    assert samples[0]["00011.png"].shape == (18, 32, 3)
-    assert samples[0]["json"]["summary"]["frames"] == 12
+
+
+def _small_copy(undisturbed, folder):
+    """The record and results of a sweep, without its runs."""
+    folder.mkdir()
+    shutil.copy(undisturbed / "sweep.json", folder)
+    shutil.copytree(undisturbed / "results", folder / "results")
+    return folder
+
+
+def test_only_complete_runs(undisturbed, tmp_path):
+    pytest.importorskip("webdataset")
+    folder = _small_copy(undisturbed, tmp_path / "some")
+    (folder / "results/00000.json").write_text(json.dumps({"status": "failed", "reason": "It was too windy."}))
+    (folder / "results/00003.json").unlink()
+    samples = _read(write_shards(folder, frames=False))
+    assert [s["__key__"] for s in samples] == ["00001", "00002", "00004", "00005", "00006", "00007"]
+    assert samples[0]["json"]["settings"]["wind.flow"] == [4.0, 1.0, 0.0]
+
+
+def test_text_and_vectors_on_axes(undisturbed, tmp_path):
+    pytest.importorskip("webdataset")
+    folder = _small_copy(undisturbed, tmp_path / "some")
+    record = json.loads((folder / "sweep.json").read_text())
+    for number, run in enumerate(record["runs"]):
+        run |= {"material.law": "Sand", "flag": number > 3, "long": [1.0] * (1 + number % 2), "none": None}
+    (folder / "sweep.json").write_text(json.dumps(record))
+    samples = _read(write_shards(folder, frames=False))
+    assert samples[0]["json"]["parameter_names"][-2:] == ["wind.seed", "flag"]
+    assert [samples[place]["parameters.npy"][-1] for place in (3, 4)] == [0, 1]
+
+
+def test_what_was_not_recorded_is_told(undisturbed, tmp_path):
+    pytest.importorskip("webdataset")
+    folder = _small_copy(undisturbed, tmp_path / "some")
+    for wanted, setting in (("frames", "renders"), ("positions", "trajectory"), ("nodes", "nodes")):
+        with value_error(f"leave out `{wanted}`, or sweep with recorder.{setting}"):
+            write_shards(folder, **{"frames": False, wanted: True})
+    with value_error(r"not the folder of a sweep"):
+        write_shards(tmp_path)
+    shutil.rmtree(folder / "results")
+    with value_error(r"finish it with --resume"):
+        write_shards(folder)
 
 
 def test_the_shards_of_a_sweep(undisturbed, tmp_path, sweep_file, capsys):

@@ -78,5 +78,5 @@ def test_training_on_two_gpus(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, timeout=500)
     assert done.returncode == 0, done.stderr[-2000:]
     assert len(list((tmp_path / "two").rglob("*.ply"))) == 1
-    log = [row for row in rows(tmp_path / "two/csv/version_0/metrics.csv") if row.get("val/psnr")]
+    log = [row for row in rows(tmp_path / "two/csv/metrics.csv") if row.get("val/psnr")]
     assert float(log[-1]["val/psnr"]) > 18

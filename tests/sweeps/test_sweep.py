@@ -4,7 +4,11 @@ import errno
 import json
 import os
 import signal
+import subprocess
+import sys
+import time
 from concurrent.futures import Future
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -150,6 +154,27 @@ def test_ctrl_c_of_the_terminal_is_for_the_driver_alone(tmp_path, sweep_file, mo
     file = sweep_file(tmp_path / "one.yaml", {"wind.seed": [1]}, 1, {"frames": 2})
     assert main([str(file), "--output", str(tmp_path / "out"), *QUICK]) == 0
     assert _attempts(tmp_path / "out") == [1]
+
+
+ORPHAN = """
+import os, sys, time
+from gaussian_swaying.sweeps.run import _end_with_parent
+if os.fork() == 0:
+    _end_with_parent()
+    open(sys.argv[1], "w").write(str(os.getpid()))
+    time.sleep(100)
+while not os.path.exists(sys.argv[1]) or not os.path.getsize(sys.argv[1]):
+    time.sleep(0.1)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks into /proc")
+def test_a_worker_with_nothing_to_do_ends_with_its_driver(tmp_path):
+    subprocess.run([sys.executable, "-c", ORPHAN, tmp_path / "pid"], check=True, cwd=Path(__file__).parents[2])
+    stat, end = Path("/proc") / (tmp_path / "pid").read_text() / "stat", time.monotonic() + 60
+    while stat.exists() and ") Z " not in stat.read_text():
+        assert time.monotonic() < end
+        time.sleep(0.2)
 
 
 # ---- failures

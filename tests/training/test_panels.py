@@ -1,4 +1,4 @@
-"""Panels and the metric that needs weights."""
+"""Panels."""
 
 import torch
 from shared import near
@@ -8,7 +8,7 @@ from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.rendering.torch_renderer import TorchRenderer
 from gaussian_swaying.scenes.procedural import FlagScene
-from gaussian_swaying.training.panels import lpips_metric, panel
+from gaussian_swaying.training.panels import panel
 
 
 def test_a_panel_shows_four_pictures():
@@ -23,9 +23,3 @@ def test_a_panel_shows_four_pictures():
     normals, areas = result[15, 100], result[15, 140]
     near(normals, torch.tensor([0.5, 0.5, 1.0]), 0.03)
     assert areas.std() > 0.05  # equal areas have one colour of the ramp, which is none of its greys
-
-
-def test_no_weights_no_lpips(tmp_path, monkeypatch):
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    assert lpips_metric("alex") is None
-    assert not any(tmp_path.rglob("*.pth"))

@@ -105,7 +105,7 @@ def _fit(rank, views, cloud, out, port):
         **quiet,
     )
     densification = DefaultDensification(start=1, every=8, grow_grad2d=1e-4)
-    module = SplatTrainer(sh_degree=1, sh_every=7, densification=densification, lpips=None)
+    module = SplatTrainer(sh_degree=1, sh_every=7, densification=densification)
     trainer.fit(module, _Views(views, cloud))
     parameters = {name: getattr(module.splat, name).detach() for name in PARAMETERS}
     torch.save({"steps": trainer.global_step, "parameters": parameters}, f"{out}/{rank}.pt")
@@ -142,7 +142,7 @@ def test_two_processes_make_one_splat(tmp_path):
         done = _train(tmp_path / f"of{devices}", capture, "--trainer.devices", str(devices))
         assert done.returncode == 0, done.stderr[-2000:]
         assert done.stdout.count("point_cloud.ply\n") == 1  # one process tells it
-        log = [row for row in rows(tmp_path / f"of{devices}/csv/version_0/metrics.csv") if row.get("val/psnr")]
+        log = [row for row in rows(tmp_path / f"of{devices}/csv/metrics.csv") if row.get("val/psnr")]
         psnr.append(float(log[-1]["val/psnr"]))
         (ply,) = (tmp_path / f"of{devices}").rglob("*.ply")
         counts.append(len(read_ply(ply).means))

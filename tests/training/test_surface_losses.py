@@ -330,7 +330,7 @@ def _train(data, make_trainer, terms):
             pass
 
     torch.manual_seed(0)
-    module = SplatTrainer(loss_terms=terms, sh_degree=0, lpips=None, log_every=1)
+    module = SplatTrainer(loss_terms=terms, sh_degree=0, log_every=1)
     make_trainer(8, logger=Log()).fit(module, data)
     return module, logged
 

@@ -6,6 +6,7 @@ import json
 import os
 import tempfile
 from pathlib import Path
+from typing import Any
 
 from gaussian_swaying.captures.generated_capture import GeneratedCapture
 from gaussian_swaying.training.data.datamodule import CaptureDataModule
@@ -20,41 +21,17 @@ class GeneratedDataModule(CaptureDataModule):
     Args:
         path: Folder of the images; created if it does not exist.
         capture: The capture to draw.
-        test_every: Every n-th image is for testing.
-        workers: Threads that draw and read the images.
         points: Initial points of the Gaussians: ``random`` in the space that the cameras see, or a file.
-        point_count: Number of points, where they are drawn at random.
-        seed: Of the order and of random points; by default that of ``seed_everything``, or 0.
-        initial_opacity: Opacity of the Gaussians at these points, between 0 and 1.
-        initial_scale: Their standard deviation as a multiple of the distance to their neighbours.
+        options: Further arguments of :class:`~gaussian_swaying.training.data.datamodule.CaptureDataModule`.
 
     Raises:
         ValueError: In ``setup``, if the folder contains something else, or images of another flag.
     """
 
     def __init__(
-        self,
-        path: str | os.PathLike[str],
-        capture: GeneratedCapture,
-        test_every: int = 8,
-        workers: int = 4,
-        points: str = "random",
-        point_count: int = 100_000,
-        seed: int | None = None,
-        initial_opacity: float = 0.1,
-        initial_scale: float = 1.0,
+        self, path: str | os.PathLike[str], capture: GeneratedCapture, points: str = "random", **options: Any
     ) -> None:
-        super().__init__(
-            path,
-            "transforms",
-            test_every=test_every,
-            workers=workers,
-            points=points,
-            point_count=point_count,
-            seed=seed,
-            initial_opacity=initial_opacity,
-            initial_scale=initial_scale,
-        )
+        super().__init__(path, points=points, **options)
         self.generated = capture
 
     def setup(self, stage: str | None = None) -> None:
