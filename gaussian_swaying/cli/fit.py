@@ -32,8 +32,12 @@ def build_parser() -> argparse.ArgumentParser:
         "and E are not absolute")  # fmt: skip
     add("--up", nargs="+", metavar="UP", help="+x, -x, ... -z or 3 numbers: up in the splat, instead of a guess")
     add("--hold", metavar="END", help="end that is held: top, bottom, none, +x, ... or -z, instead of a guess")
-    add("--focal", type=float, metavar="MM", help="focal length of the film, equivalent to 35 mm film; if "
-        "left out, that which the film says, or found")  # fmt: skip
+    add(
+        "--focal",
+        type=float,
+        metavar="MM",
+        help="focal length as on 35 mm film; else that of the film's tags, or found",
+    )
     add("--config", help="instead of FILM: a YAML file with base, videos, unknowns and, if needed, known; docs/fit.md")
     add("--check", action="store_true", help="only write the files and pictures to look at before the fit")
     add("--output", help="folder for the results; outputs/fits/<name of the film or file> if left out")
@@ -46,8 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Parse and fit.
 
     Returns:
-        0 on success, 2 on bad input or if the video cannot tell the unknowns apart, 130 if stopped with Ctrl-C, 143 by
-        SIGTERM. With ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
+        0 on success, 2 on bad input or if the video cannot tell the unknowns apart, 130 after Ctrl-C, 143 after SIGTERM.
     """
     arguments = joined(sys.argv[1:] if arguments is None else arguments)
     parser, begun = build_parser(), list[str]()
@@ -76,8 +79,8 @@ def fit(options: argparse.Namespace, begun: list[str]) -> int:
             whole = Path(options.output or Path("outputs") / "fits" / Path(options.film).stem)
             up = None if options.up is None else up_of(options.up)
             given: dict[str, Any] = {name: getattr(options, name) for name in ("hold", "focal", "device")}
-            file = prepare(options.film, options.splat, whole, length=_length(options.length), up=up, **given)
-            folder = whole / RESULT
+            folder, length = whole / RESULT, _length(options.length)
+            file = prepare(options.film, options.splat, whole, length=length, up=up, **given)
             print(f"wrote {file}", flush=True)
         again = program.command("fit", "--config", options.config or file, "--output", folder)
         plan = read_plan(file, lambda name: with_shipped(["--config", name], "sim")[1])
