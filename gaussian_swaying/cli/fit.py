@@ -32,12 +32,7 @@ def build_parser() -> argparse.ArgumentParser:
         "and E are not absolute")  # fmt: skip
     add("--up", nargs="+", metavar="UP", help="+x, -x, ... -z or 3 numbers: up in the splat, instead of a guess")
     add("--hold", metavar="END", help="end that is held: top, bottom, none, +x, ... or -z, instead of a guess")
-    add(
-        "--focal",
-        type=float,
-        metavar="MM",
-        help="focal length as on 35 mm film; else that of the film's tags, or found",
-    )
+    add("--focal", type=float, metavar="MM", help="focal length as on 35 mm film; else that of its tags, or found")
     add("--config", help="instead of FILM: a YAML file with base, videos, unknowns and, if needed, known; docs/fit.md")
     add("--check", action="store_true", help="only write the files and pictures to look at before the fit")
     add("--output", help="folder for the results; outputs/fits/<name of the film or file> if left out")
@@ -50,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Parse and fit.
 
     Returns:
-        0 on success, 2 on bad input or if the video cannot tell the unknowns apart, 130 after Ctrl-C, 143 after SIGTERM.
+        0 on success, 2 on bad input or if the video cannot tell the unknowns apart, 130 after Ctrl-C, 143 by SIGTERM.
     """
     arguments = joined(sys.argv[1:] if arguments is None else arguments)
     parser, begun = build_parser(), list[str]()
