@@ -13,7 +13,6 @@ import torch
 
 from gaussian_swaying import _program as program
 from gaussian_swaying._checks import check_positive
-from gaussian_swaying._files import write_text
 from gaussian_swaying.cli.errors import run_command  # first, as it sets up threads
 from gaussian_swaying.gaussians.formats import (
     FORMATS,
@@ -24,11 +23,10 @@ from gaussian_swaying.gaussians.formats import (
     numbered,
     read_gaussians,
 )
-from gaussian_swaying.gaussians.ply import check_folder
 from gaussian_swaying.gaussians.spz import VERSIONS
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.simulation.simulation import RecordedRun
-from gaussian_swaying.viewer.film.page import PAGE, write_film
+from gaussian_swaying.viewer.film.page import write_film, write_player
 
 
 def build_options() -> argparse.ArgumentParser:
@@ -60,7 +58,8 @@ def build_options() -> argparse.ArgumentParser:
     parser.add_argument(
         "--player",
         action="store_true",
-        help="Write sway.js into the folder `source`: the module that plays .sway files with three.js and Spark.",
+        help="Write what plays .sway files elsewhere into the folder `source`: a module for three.js and Spark, and "
+        "the element <gaussian-swaying>, which also shows pages that simulate.",
     )
     parser.add_argument(
         "--apart",
@@ -107,11 +106,7 @@ def main(arguments: list[str] | None = None) -> int:
 def export(options: argparse.Namespace) -> None:
     """Convert, and report the file."""
     if options.player:
-        folder = Path(options.source)
-        check_folder(folder / "sway.js")
-        write_text(folder / "sway.js", (PAGE / "sway.min.js").read_text(encoding="utf-8"))
-        print(f"wrote {folder / 'sway.js'}")
-        return None
+        return print("\n".join(f"wrote {path}" for path in write_player(Path(options.source))))
     given = {"--up": options.up, "--metres-per-unit": options.metres_per_unit}
     if options.web or Path(options.target or "").suffix == ".sway":
         refuse("a film", given | {"--spz-version": options.spz_version, "--apart": options.apart or None})

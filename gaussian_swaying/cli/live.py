@@ -13,7 +13,7 @@ from gaussian_swaying import _program as program
 from gaussian_swaying.cli.errors import run_command
 from gaussian_swaying.cli.scene import is_given, settings_of, words_of
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.viewer.controls import Page
+from gaussian_swaying.viewer.server import Server
 from gaussian_swaying.viewer.session import Session, in_real_time, share_cores
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ def session_of(parser: ArgumentParser, settings: Namespace, real_time: bool) -> 
 def _live(arguments: Sequence[str]) -> None:
     parser = Simulation.parser()
     options, further = split(parser, arguments)
-    page = Page(options.host, options.port, options.pixels, options.allow_host)
+    page = Server(options.host, options.port, options.pixels, options.allow_host)
     session = None
     try:
         print(f"The wind blows at {page.url} (Ctrl-C ends it).", flush=True)

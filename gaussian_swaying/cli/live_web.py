@@ -13,7 +13,7 @@ from gaussian_swaying.cli.scene import settings_of, words_of
 from gaussian_swaying.config.parser import scene_name
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.live_web.budget import TARGETS, fitted
-from gaussian_swaying.viewer.live_web.page import ELEMENT, write_element, write_live_web
+from gaussian_swaying.viewer.live_web.page import write_live_web
 
 
 def build_options() -> argparse.ArgumentParser:
@@ -31,11 +31,6 @@ def build_options() -> argparse.ArgumentParser:
         "--target",
         choices=tuple(TARGETS),
         help="fit the points and the grid to this kind of machine; without it they are those of the configuration",
-    )
-    parser.add_argument(
-        "--element",
-        action="store_true",
-        help="also write gaussian-swaying.js beside the page, to show it in another page",
     )
     return parser
 
@@ -69,9 +64,6 @@ def export_live_web(arguments: Sequence[str]) -> None:
     for note in (*notes, *film.notes):
         print(f"note: {note.replace('the film', 'the page')}")
     print(f"{film.head['count']:,} Gaussians, {simulation.model.points.count:,} material points")
-    if options.element:
-        write_element(target.parent)
-        print(f"wrote {target.with_name(ELEMENT)}")
     print(f"wrote {target} ({target.stat().st_size / 1e6:.1f} MB)")
 
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 import tempfile
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,42 +16,57 @@ from PIL import Image
 from torch import Tensor
 
 from gaussian_swaying._devices import in_double
-from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.recording.video import VideoEncoder
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.passes import PASSES
 from gaussian_swaying.rendering.tints import by_role
+from gaussian_swaying.simulation.body import SimulatedScene
 from gaussian_swaying.simulation.draw import View
 from gaussian_swaying.viewer.session import Snapshot
 
 LEAST = 96  # pixels of the shorter side
 SIZES = (1.0, 0.75, 0.5, 0.375, 0.25)
+MOST_SIDE = 16384  # pixels of a browser's window
+FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))  # to a camera with y down and z forward
 
 
-def camera_of(
-    wxyz: Sequence[float], position: Sequence[float], fov: float, width: int, height: int, near: float = 0.01
-) -> Camera:
-    """A camera from its pose.
+@dataclass(frozen=True)
+class Eye:
+    """How a browser looks at the scene.
 
-    Args:
-        wxyz: Rotation from camera to scene, a quaternion; x to the right, y down, z forward.
-        position: Eye [scene units].
+    Attributes:
+        matrix: From the axes of its camera, y up and z backwards, to those of a film, float64, shape (4, 4).
         fov: Vertical field of view [rad].
-        width: Width of the picture [pixels].
-        height: Height of the picture [pixels].
-        near: Nearest depth that is drawn [scene units].
+        near: Nearest depth that is drawn, in units of a film.
+        size: Width and height of its window [pixels].
     """
-    rotation = quat_to_rotation(torch.tensor(list(wxyz), dtype=torch.float64))
-    return pinhole(rotation, torch.tensor(list(position), dtype=torch.float64), fov, width, height, near)
 
+    matrix: Tensor
+    fov: float
+    near: float
+    size: tuple[int, int]
 
-def pinhole(rotation: Tensor, eye: Tensor, fov: float, width: int, height: int, near: float = 0.01) -> Camera:
-    """As :func:`camera_of`, with the rotation as a matrix (3, 3) and the eye (3,), both float64."""
-    view = torch.eye(4, dtype=torch.float64)
-    view[:3, :3], view[:3, 3] = rotation.mT, -rotation.mT @ eye
-    focal = 0.5 * height / math.tan(0.5 * fov)
-    intrinsics = torch.tensor([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]]).double()
-    return Camera(view, intrinsics, width, height, near)
+    @classmethod
+    def told(cls, message: Mapping[str, Any]) -> Eye:
+        """From a message with ``matrix`` (column by column), ``fov`` [degrees], ``near`` and ``size``."""
+        matrix = torch.tensor(message["matrix"], dtype=torch.float64).reshape(4, 4).T
+        fov, near = math.radians(message["fov"]), float(message["near"])
+        width, height = (int(side) for side in message["size"])
+        if not (bool(matrix.isfinite().all()) and 0 < fov < math.pi and 1e-9 < near < 1e9):
+            raise ValueError("the view is not finite")
+        if not (0 < width <= MOST_SIDE and 0 < height <= MOST_SIDE):
+            raise ValueError(f"the window is not of 1 to {MOST_SIDE} pixels")
+        return cls(matrix, fov, near, (width, height))
+
+    def camera(self, scene: SimulatedScene, width: int, height: int) -> Camera:
+        """The camera of a picture with so many pixels, in scene units."""
+        rotation = scene.frame.rotation.T.cpu().double() @ self.matrix[:3, :3] @ FLIP
+        place = scene.frame.point_to_scene(self.matrix[:3, 3] * scene.size * scene.frame.metres_per_unit)
+        view = torch.eye(4, dtype=torch.float64)
+        view[:3, :3], view[:3, 3] = rotation.mT, -rotation.mT @ place
+        focal = 0.5 * height / math.tan(0.5 * self.fov)
+        intrinsics = torch.tensor([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]]).double()
+        return Camera(view, intrinsics, width, height, self.near * scene.size)
 
 
 @torch.inference_mode()

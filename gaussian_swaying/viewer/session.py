@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import copy
 import math
+import os
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -17,7 +19,9 @@ import yaml
 from torch import Tensor
 
 from gaussian_swaying._checks import one_line
+from gaussian_swaying._inputs import spare_memory
 from gaussian_swaying.config.parser import config_text
+from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.state import State
@@ -28,7 +32,7 @@ from gaussian_swaying.simulation.measure import FrameDiagnostics, SimulationDive
 from gaussian_swaying.simulation.model import find, in_settings, number, of_settings
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.suggestion.cost import Cost, estimate_cost
-from gaussian_swaying.suggestion.suggest import QUALITIES
+from gaussian_swaying.suggestion.suggest import QUALITIES, suggest
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
@@ -174,9 +178,6 @@ class Pull(Force):
         return self.held[:, None] * pull - damping[:, None] * state.velocity, damping
 
 
-if TYPE_CHECKING:
-    from jsonargparse import ArgumentParser, Namespace
-
 SLOW, FAST = 0.09, 0.025  # s: steps that take longer are halved, and shorter ones doubled again
 SHORTEST, FEW = 32, 4  # a step is at least this part of `frame_dt`; substeps of one that would take as long if shorter
 WINDOW = 2.0  # s, over which rates are averaged
@@ -236,6 +237,39 @@ class Past:
     time: float
 
 
+SPARE = 1 << 26
+"""Memory that a splat may take besides a multiple of its size [bytes]: less than elsewhere, as others may upload it."""
+
+
+def settings_of_splat(
+    parser: ArgumentParser,
+    path: str | os.PathLike[str],
+    device: torch.device,
+    folder: Path,
+    further: Sequence[str] = (),
+    tell: Callable[[float, str], None] = lambda share, what: None,
+    quick: bool = False,
+) -> Namespace:
+    """The settings that the preview suggests for a splat.
+
+    Args:
+        parser: From :meth:`Simulation.parser`.
+        path: The splat.
+        device: Device of the simulation.
+        folder: Gets ``parts.npz``, which the settings name, if the splat has parts.
+        further: Options that replace what is suggested.
+        tell: Called with the share that is done, from 0 to 1, and the name of the next task.
+        quick: Whether the grid is a coarser one than that of its starter.
+    """
+    tell(0.05, "Reading the splat")
+    with spare_memory(SPARE):
+        gaussians = read_gaussians(path)
+    tell(0.15, "Looking for a region, pins, a grid and how it sways")
+    found = suggest(gaussians, quality="draft" if quick else "normal", device=device.type)
+    found.to_yaml(folder / "starter.yaml", splat=Path(path))
+    return parser.parse_args(["--config", str(folder / "starter.yaml"), "--device", device.type, *further])
+
+
 def share_cores() -> None:
     """Give threads that start from now on half of the cores: one simulates and one draws, on a CPU."""
     torch.set_num_threads(max(1, torch.get_num_threads() // 2))
@@ -260,6 +294,7 @@ class Session:
             another scene, or a change that was refused.
         speed: Simulated seconds per second that are wanted; 1 is real time.
         configured_dx: Grid spacing of the configuration [m]; the session may begin with a coarser one.
+        first_dx: Grid spacing with which it began [m].
         lock: Taken while the simulation is changed, and while it is drawn.
     """
 
@@ -276,9 +311,10 @@ class Session:
         self._steps: deque[tuple[float, float]] = deque()  # when, and simulated time, of the last steps
         self._anchor: tuple[float, float] | None = None
         self._pull: Pull | None = None
+        self._aim: Sequence[float] | None = None  # where it is to pull to
         self._number = self._motion = 0
         self._first = settings  # those that `restore` goes back to
-        self.configured_dx = float(settings.solver.dx)
+        self.configured_dx = self.first_dx = float(settings.solver.dx)
         self._past: deque[Past] = deque(maxlen=MOST_UNDONE)
         self.simulation = _drawn_roughly(simulation or Simulation.from_settings(parser, settings))
         self._begin(self.simulation.start())
@@ -326,7 +362,7 @@ class Session:
             try:
                 self._take_settings(settings, fresh=True)
                 self._first = settings
-                self.configured_dx = float(settings.solver.dx)
+                self.configured_dx = self.first_dx = float(settings.solver.dx)
                 self._past.clear()
                 self.revision += 1
                 done()
@@ -373,8 +409,10 @@ class Session:
         self._ask(lambda: self._grab(place))
 
     def drag(self, place: Sequence[float]) -> None:
-        """Pull the grabbed material towards a place [scene units]."""
-        self._ask(lambda: None if self._pull is None else self._pull.aim(place))
+        """Pull the grabbed material towards a place [scene units]; of several before the next step the last counts."""
+        with self._wake:
+            self._aim = place
+            self._wake.notify_all()
 
     def let_go(self) -> None:
         self._ask(self._let_go)
@@ -420,19 +458,25 @@ class Session:
     def _loop(self) -> None:
         while True:
             with self._wake:
-                while not (self._closed or self._asked or self._changes or self._single or self._runs()):
+                while not (self._closed or self._busy() or self._single or self._runs()):
                     self._wake.wait()
                 if self._closed:
                     return
                 asked, self._asked = self._asked, []
                 changes, self._changes = self._changes, {}
+                aim, self._aim = self._aim, None
                 single, self._single = self._single and not self._broken, False
             for what in asked:
                 self._safely(what)
             if changes:
                 self._safely(partial(self._change, changes))
+            if aim is not None and self._pull is not None:
+                self._safely(partial(self._pull.aim, aim))
             if single or self._runs():
                 self._advance(single)
+
+    def _busy(self) -> bool:
+        return bool(self._asked or self._changes or self._aim is not None)
 
     def _runs(self) -> bool:
         return not self.paused and not self._broken
@@ -488,7 +532,7 @@ class Session:
             self._anchor = (now, simulated)
         elif due > now:
             with self._wake:
-                self._wake.wait_for(lambda: bool(self._closed or self._asked or self._changes), due - now)
+                self._wake.wait_for(lambda: self._closed or self._busy(), due - now)
 
     def pace(self, speed: float) -> None:
         """Set the wanted speed, in simulated seconds per second."""
@@ -578,9 +622,6 @@ def _drawn_roughly(simulation: Simulation) -> Simulation:
     simulation.painter.renderer = make_renderer(simulation.device, detail=DETAIL)
     return simulation
 
-
-if TYPE_CHECKING:
-    from jsonargparse import ArgumentParser, Namespace
 
 HEADROOM = 1.25  # x real time, so that the page can be drawn and the material stiffen
 MARGIN = 1.2  # a grid is tried that should be so many times faster still: a trial is short, and its time not exact

@@ -20,8 +20,7 @@ from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.scenes import FlagScene
 from gaussian_swaying.scenes.alocasia import alocasia
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.viewer import controls
-from gaussian_swaying.viewer.controls import settings_of_splat
+from gaussian_swaying.viewer.session import settings_of_splat
 
 
 def test_options_and_scene_come_in_any_order(parser):
@@ -88,7 +87,6 @@ def test_a_plant_in_a_pot_moves_in_it(parser, tmp_path):
 
 
 def test_bad_input_is_one_sentence(capsys, tmp_path):
-    pytest.importorskip("viser")
     refused(live.main, [str(tmp_path / "none.ply"), "--device=cpu", "--no-browser"], capsys, "none.ply")
     refused(live.main, ["--solver.dxx=3", "--no-browser"], capsys, "dxx")
 
@@ -118,7 +116,7 @@ def test_the_grid_is_chosen_for_real_time_unless_it_is_given(capsys, monkeypatch
         "solver: {dx: 0.04}\nframe_dt: 0.04\ndevice: cpu\n"
     )
     before = file.read_bytes()
-    monkeypatch.setattr(live, "Page", FakePage)
+    monkeypatch.setattr(live, "Server", FakePage)
     monkeypatch.setattr(live, "share_cores", lambda: None)
     monkeypatch.setattr("gaussian_swaying.viewer.session.estimate_cost", cubed)
     assert live.main([str(file), "--no-browser", *options]) == 0
@@ -143,7 +141,6 @@ def cubed(simulation, frames, budget, pictures):
 
 
 def test_ctrl_c_ends_it_cleanly(tmp_path):
-    pytest.importorskip("viser")
     code = "import sys; from gaussian_swaying.cli.main import main; sys.exit(main(sys.argv[1:]))"
     command = [sys.executable, "-c", code, "live", "--no-browser", "--port=8500", "--device=cpu", "--solver.dx=0.1"]
     process = subprocess.Popen(
@@ -172,7 +169,7 @@ def test_a_splat_has_the_wind_of_its_preview(tmp_path):
     splat = tmp_path / "flag.ply"
     export_cloud(splat, FlagScene(spacing=0.05, stand="pole").generate())
     parser = Simulation.parser()
-    live = controls.settings_of_splat(parser, splat, torch.device("cpu"), tmp_path)
+    live = settings_of_splat(parser, splat, torch.device("cpu"), tmp_path)
     assert preview([str(splat), "--output", str(tmp_path / "look"), "--device", "cpu"]) == 0
     starter = parser.parse_args(["--config", str(tmp_path / "look" / "starter.yaml")])
     turbulence = live.wind.effects[0]["init_args"]

@@ -75,7 +75,7 @@ def test_a_run_imports_only_what_it_needs(tmp_path):
     """On a CPU, with pictures and a video; each of these takes a tenth of a second or more."""
     heavy = ["cv2", "gsplat", "imageio", "lightning", "matplotlib", "pandas", "PIL.TiffImagePlugin", "scipy.optimize"]
     heavy += ["scipy.stats", "setuptools", "sympy", "torch._dynamo", "torch._inductor", "torch.utils.cpp_extension"]
-    heavy += ["torchmetrics", "triton", "viser"]
+    heavy += ["torchmetrics", "triton", "aiohttp"]
     small = ["--config=flag", "--scene.generator.init_args.spacing=0.05", "--solver.dx=0.1", "--frames=2"]
     small += ["--camera.init_args.width=32", "--camera.init_args.height=18", "--device=cpu", f"--output={tmp_path}"]
     run = f"import sys; from gaussian_swaying.cli.main import main; main(['sim', *{small}])"

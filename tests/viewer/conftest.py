@@ -1,10 +1,15 @@
 """A small flag, and a session of it."""
 
+import asyncio
+import json
 import threading
+import time
 
+import aiohttp
 import pytest
 from browsers import listened, until
 
+from gaussian_swaying.viewer.server import Server
 from gaussian_swaying.viewer.session import Session
 
 SMALL = [
@@ -51,58 +56,79 @@ def pause(session):
     in_turn(session)
 
 
-def pictures_since(page, began):
-    """Pictures that the server has drawn for its browsers from a time on; a page remembers its last 120 only."""
-    return sum(start > began for times in list(page._drawn.values()) for start in list(times))
-
-
-POSE = {"wxyz": [0.7071, -0.7071, 0, 0], "position": [0.6, -2, 0.4], "look_at": [0.6, 0, 0.4], "fov": 0.8}
-POSE |= {"up_direction": [0, 0, 1], "near": 0.01, "far": 100.0}
+# a camera in the axes of a film, y up and z backwards, column by column: it looks along y from in front of the object
+LOOK = {"matrix": [1, 0, 0, 0, 0, 0, 1, 0, 0, -1, 0, 0, 0, -2, 0, 1], "fov": 40.0, "near": 0.01, "size": [400, 300]}
 
 
 class Client:
-    """A browser without a browser: sends what it likes, and reads as few frames ahead as possible."""
+    """A browser without a browser: says what it likes, and confirms what it takes in."""
 
-    def __init__(self, page, width=64, height=32, **options):
-        viser = pytest.importorskip("viser", reason="needs the extra [viewer]")
-        self._encode = pytest.importorskip("msgspec").msgpack.encode
-        connect = pytest.importorskip("websockets.sync.client").connect
-        protocols = [f"viser-v{viser.__version__}"]
-        address = page.url.replace("http", "ws")
-        quiet = {"max_size": None, "max_queue": 1, "close_timeout": 1, "ping_interval": None}
-        self.socket = connect(address, subprotocols=protocols, **quiet, **options)
-        self.look(image_width=width, image_height=height)
+    def __init__(self, server, **options):
+        self._loop, self._count = asyncio.new_event_loop(), 0
+        self._session = self._run(self._open())
+        self.socket = self._run(self._session.ws_connect(f"{server.url.split('/?')[0]}/socket", **options))
 
-    def look(self, **pose):
-        self.send("ViewerCameraMessage", **(POSE | {"image_width": 64, "image_height": 32} | pose))
+    async def _open(self):
+        return aiohttp.ClientSession()
 
-    def send(self, kind, **fields):
-        self.socket.send(self._encode({"type": kind, **fields}))
+    def _run(self, what):
+        return self._loop.run_until_complete(what)
 
-    def set(self, control, value):
-        self.send("GuiUpdateMessage", uuid=control._impl.uuid, updates={"value": value})
+    def say(self, kind, **fields):
+        self._run(self.socket.send_str(json.dumps({"kind": kind, **fields})))
 
-    def drag(self, name, position):
-        self.send("TransformControlsUpdateMessage", name=name, wxyz=[1, 0, 0, 0], position=position, owner="")
+    def get(self, seconds=20.0, confirm=True):
+        """The head of the next message, with its bytes as ``rest``."""
+        said = self._run(asyncio.wait_for(self.socket.receive(), seconds))
+        if said.type is aiohttp.WSMsgType.TEXT:
+            head = json.loads(said.data)
+        else:
+            assert said.type is aiohttp.WSMsgType.BINARY, said
+            size = int.from_bytes(said.data[:4], "little")
+            head = json.loads(said.data[4 : 4 + size]) | {"rest": said.data[4 + size :]}
+        self._count += "rest" in head
+        if confirm and "rest" in head:
+            self.confirm()
+        return head
 
-    def click(self, origin, direction):
-        place = {"ray_origin": origin, "ray_direction": direction, "screen_pos": [[0.5, 0.5]]}
-        self.send("ScenePointerMessage", event_type="click", modifier=None, **place)
+    def confirm(self):
+        self.say("ack", count=self._count, rate=30.0)
+
+    def wait(self, kind, holds=lambda head: True, seconds=60.0, **wanted):
+        """Take messages in until one of a kind comes, with these values."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            head = self.get()
+            if head["kind"] == kind and wanted.items() <= head.items() and holds(head):
+                return head
+        raise AssertionError(f"there was no {kind}")
+
+    def control(self, name, holds):
+        """Wait until the panel has a control with a value."""
+
+        def found(panel):
+            known = {one["name"]: one for part in panel["groups"] for one in part["controls"]}
+            return name in known and holds(known[name].get("value"))
+
+        return self.wait("panel", found)
 
     def close(self):
-        self.socket.close()
+        if self._loop.is_closed():
+            return
+        self._run(self.socket.close())
+        self._run(self._session.close())
+        self._loop.close()
 
 
 @pytest.fixture
 def connect():
-    """Connects to a page, which knows of it then; what is open at the end is closed."""
+    """Connects to a server, and looks from :data:`LOOK`; what is open at the end is closed."""
     opened = []
 
-    def connect(page, *arguments, wait=True, **options):
-        known = len(page.server.get_clients())
-        opened.append(Client(page, *arguments, **options))
-        if wait:
-            until(lambda: len(page.server.get_clients()) > known)
+    def connect(server, looks=True, **options):
+        opened.append(Client(server, **options))
+        if looks:
+            opened[-1].say("view", **LOOK)
         return opened[-1]
 
     yield connect
@@ -111,41 +137,25 @@ def connect():
 
 
 @pytest.fixture
-def join(connect):
-    """Connects to a page: the client, and the key with which its program opens connections of its own."""
-
-    def join(page):
-        known = set(page.streams._lines)
-        client = connect(page)
-        until(lambda: set(page.streams._lines) - known)
-        return client, *(set(page.streams._lines) - known)
-
-    return join
-
-
-@pytest.fixture
 def show(parser, settings):
-    """Shows a session, which is that of a small flag unless it is given, on a page; both are closed at the end."""
-    pytest.importorskip("viser", reason="needs the extra [viewer]")
-    from gaussian_swaying.viewer.controls import Page
-
+    """Shows a session, which is that of a small flag unless it is given; both are closed at the end."""
     shown = []
 
-    def show(session=None, page=None, **options):
-        page = page or Page(**{"port": 8400, "largest": 320, **options})
-        shown.append(page.show(session or Session(parser, settings)))
-        page.session.start()
-        return page
+    def show(session=None, server=None, **options):
+        server = server or Server(**{"port": 8400, "largest": 320, **options})
+        shown.append(server.show(session or Session(parser, settings)))
+        server.session.start()
+        return server
 
     yield show
-    for page in shown:
-        page.close()
-        page.session.close()
+    for server in shown:
+        server.close()
+        server.session.close()
 
 
 @pytest.fixture
 def page(show):
-    """A page with a small flag, and its session, which runs."""
+    """A server with a small flag, and its session, which runs."""
     return show()
 
 
@@ -177,8 +187,14 @@ def shading_browser(launch):
     return launch(*DRAWN, "--enable-unsafe-webgpu")
 
 
-READY = "wind.on && wind.drawing.ready"
-PATIENT = "addEventListener('DOMContentLoaded', () => (wind.patience = 1e9))"
+def holds(window, condition):
+    """Wait until a condition holds in a window, which may evaluate no text by itself."""
+    guarded = f"(() => {{ try {{ return {condition}; }} catch {{ return false; }} }})()"
+    until(lambda: window.evaluate(guarded), 90)
+
+
+READY = "wind.on && wind.view.drawing.ready"
+PATIENT = "addEventListener('load', () => (wind.patience = 1e12))"
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """Pictures from the camera of a browser, picking, and their size."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -8,23 +9,32 @@ import torch
 from PIL import Image
 from shared import value_error
 
-from gaussian_swaying.geometry.rotations import rotation_to_quat
 from gaussian_swaying.rendering.passes import PASSES
 from gaussian_swaying.simulation.draw import View
-from gaussian_swaying.viewer.pictures import FilmStrip, PictureSize, camera_of, draw, enlarged, under_cursor
+from gaussian_swaying.viewer.pictures import FLIP, Eye, FilmStrip, PictureSize, draw, enlarged, under_cursor
+
+
+def told_of(camera, scene):
+    """The message of a browser that looks as a camera does."""
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3] = scene.frame.rotation @ camera.world_to_camera[:3, :3].double().mT @ FLIP
+    size = scene.size * scene.frame.metres_per_unit
+    matrix[:3, 3] = scene.frame.point_to_sim(camera.position.double()) / size
+    fov = 2 * math.degrees(math.atan(0.5 * camera.height / float(camera.intrinsics[1, 1])))
+    sides = {"size": [camera.width, camera.height], "near": 0.01 / scene.size}
+    return sides | {"matrix": matrix.T.flatten().tolist(), "fov": fov}
 
 
 def _pose(session):
-    """The camera of the configuration as a browser tells it."""
-    camera = session.simulation.painter.camera_at(0)
-    rotation = camera.world_to_camera[:3, :3].double().mT
-    fov = 2 * math.atan(0.5 * camera.height / float(camera.intrinsics[1, 1]))
-    return rotation_to_quat(rotation).tolist(), camera.position.tolist(), fov, camera
+    """The camera of the configuration: as a browser tells it, by its width and height, and itself."""
+    scene, camera = session.simulation.scene, session.simulation.painter.camera_at(0)
+    eye = Eye.told(told_of(camera, scene))
+    return partial(eye.camera, scene), camera
 
 
 def test_the_picture_is_that_of_the_simulation(session):
-    wxyz, eye, fov, camera = _pose(session)
-    picture = draw(session.snapshot, camera_of(wxyz, eye, fov, camera.width, camera.height))
+    camera_of, camera = _pose(session)
+    picture = draw(session.snapshot, camera_of(camera.width, camera.height))
     with torch.inference_mode():
         wanted = session.simulation.painter.render(session.snapshot.state, 0).color
     assert picture.dtype == np.uint8
@@ -37,8 +47,8 @@ SHOWN = [name for name, own in PASSES.items() if not own.air]
 
 @pytest.mark.parametrize("shown", SHOWN)
 def test_everything_that_can_be_shown_is_different(session, shown):
-    wxyz, eye, fov, _ = _pose(session)
-    camera = camera_of(wxyz, eye, fov, 64, 36)
+    camera_of, _ = _pose(session)
+    camera = camera_of(64, 36)
     picture = draw(session.snapshot, camera, shown)
     assert picture.shape == (36, 64, 3)
     others = [draw(session.snapshot, camera, other) for other in SHOWN if other != shown]
@@ -47,15 +57,15 @@ def test_everything_that_can_be_shown_is_different(session, shown):
 
 def test_streaks_of_air_are_those_of_the_render(session):
     """Over the paler picture."""
-    wxyz, eye, fov, camera = _pose(session)
-    small = camera_of(wxyz, eye, fov, 192, 108)
+    camera_of, camera = _pose(session)
+    small = camera_of(192, 108)
     with_air, without = (draw(session.snapshot, small, shown).astype(int) for shown in ("wind", "color"))
     drawn = np.abs(with_air - (0.75 * without + 0.25 * 255)).max(-1) > 3
     assert 0.02 < drawn.mean() < 0.8
     painter, state = session.snapshot.simulation.painter, session.snapshot.state
     with torch.inference_mode():
         wanted = View(painter, state, painter.deformed(state), camera).wind()
-    found = draw(session.snapshot, camera_of(wxyz, eye, fov, camera.width, camera.height), "wind")
+    found = draw(session.snapshot, camera_of(camera.width, camera.height), "wind")
     apart = np.abs(found.astype(float) - 255 * wanted.clamp(0, 1).numpy()).max(-1)
     assert (apart > 2.0).mean() < 1e-3  # the camera in float32: the ends of a few streaks
 
@@ -63,8 +73,8 @@ def test_streaks_of_air_are_those_of_the_render(session):
 @pytest.mark.parametrize("shown", ["normal", "force"])
 def test_edges_of_passes_fade(session, shown):
     """Between the object and the black around it some pixels are in between; a hard edge has none."""
-    wxyz, eye, fov, camera = _pose(session)
-    small = camera_of(wxyz, eye, fov, camera.width // 2, camera.height // 2)
+    camera_of, camera = _pose(session)
+    small = camera_of(camera.width // 2, camera.height // 2)
     picture = draw(session.snapshot, small, shown).max(-1).astype(float)
     inside = np.median(picture[picture > 0])
     between = ((picture > 0.1 * inside) & (picture < 0.8 * inside)).sum()
@@ -74,10 +84,10 @@ def test_edges_of_passes_fade(session, shown):
 
 def test_a_small_picture_is_shown_with_smooth_edges(session):
     """Closer to the picture at full size than a browser's linear enlargement of the small one."""
-    wxyz, eye, fov, camera = _pose(session)
+    camera_of, camera = _pose(session)
     width, height = 4 * (camera.width // 4), 4 * (camera.height // 4)
-    full = draw(session.snapshot, camera_of(wxyz, eye, fov, width, height)).astype(float)
-    small = draw(session.snapshot, camera_of(wxyz, eye, fov, width // 4, height // 4))
+    full = draw(session.snapshot, camera_of(width, height)).astype(float)
+    small = draw(session.snapshot, camera_of(width // 4, height // 4))
     ours = enlarged(small, width, height)
     assert ours.shape == full.shape
     linear = np.asarray(Image.fromarray(small).resize((width, height), Image.Resampling.BILINEAR)).astype(float)

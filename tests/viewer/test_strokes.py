@@ -3,7 +3,7 @@
 import torch
 
 from gaussian_swaying.gaussians.parts import ROLES, Part, Parts
-from gaussian_swaying.viewer.controls import MOST_KEPT, Strokes
+from gaussian_swaying.viewer.painting import MOST_KEPT, Strokes
 
 SOFT, HELD, STILL = Part("soft"), Part("held", "held"), Part("pot", "still")
 

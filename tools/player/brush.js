@@ -1,22 +1,19 @@
 // Paints parts in the live page: what the mouse does goes to the server, which finds the Gaussians. See docs/parts.md.
+import { make } from "./panel.js";
 
 const EVERY = 30; // ms between two messages of a stroke
 const MOST = 60; // corners of a path in a message
-const AGAIN = 1000; // ms until a connection that broke is opened again
 
 export class Brush {
-  // `stage` has `above`: the canvas of viser and its camera.
-  constructor(stage) {
-    this.stage = stage;
-    this.on = false;
-    this.radius = 20; // pixels
+  /** @param {any} view @param {(message: any) => void} say */
+  constructor(view, say) {
+    Object.assign(this, { view, say });
+    this.own = { on: false, radius: 20 }; // what the panel says
     this.path = null; // of the stroke that is being made, as far as it was not sent
     this.pointer = null;
-    this.ring = document.createElement("div");
-    Object.assign(this.ring.style, { position: "fixed", zIndex: 1, pointerEvents: "none", borderRadius: "50%" });
-    Object.assign(this.ring.style, { boxSizing: "border-box", border: "2px solid white" });
-    Object.assign(this.ring.style, { boxShadow: "0 0 2px black, inset 0 0 2px black", display: "none" });
-    const listen = (name, act) => addEventListener(name, (event) => this.on && act(event), { capture: true });
+    this.ring = make("div", { id: "ring", hidden: true });
+    document.body.append(this.ring);
+    const listen = (name, act) => addEventListener(name, (event) => this.own.on && act(event), { capture: true });
     listen("pointerdown", (event) => this.begin(event));
     listen("pointermove", (event) => this.move(event));
     listen("pointerup", (event) => event.pointerId === this.pointer && this.end());
@@ -25,33 +22,15 @@ export class Brush {
     listen("dblclick", (event) => this.take(event));
   }
 
-  // Open the connection; called with the key of this browser.
-  join(key) {
-    this.key = key;
-    this.socket?.close();
-    const socket = new WebSocket(`${location.origin.replace("http", "ws")}/brush?key=${key}`);
-    this.socket = socket;
-    socket.onmessage = ({ data }) => this.set(JSON.parse(data));
-    socket.onclose = () => {
-      if (socket !== this.socket) return;
-      this.set({ on: false });
-      setTimeout(() => socket === this.socket && this.join(key), AGAIN);
-    };
+  set(own) {
+    if (!own.on) this.end();
+    this.own = own;
+    this.ring.hidden ||= !own.on; // shown when the mouse moves
   }
 
-  set({ on, radius }) {
-    if (!on) this.end();
-    this.on = on;
-    this.radius = radius ?? this.radius;
-    if (on) document.body.append(this.ring);
-    this.ring.style.display = "none"; // until the mouse moves
-  }
-
-  // ---- strokes
-
-  // With Shift, or with another button, viser turns the view.
+  // With Shift, or with another button, the mouse turns the view.
   paints(event) {
-    return event.button === 0 && !event.shiftKey && event.target === this.stage.above?.canvas;
+    return event.button === 0 && !event.shiftKey && event.target === this.view.canvas;
   }
 
   begin(event) {
@@ -64,12 +43,10 @@ export class Brush {
   }
 
   move(event) {
-    const { ring, radius } = this;
-    const over = event.target === this.stage.above?.canvas;
-    ring.style.display = over || this.pointer !== null ? "block" : "none";
-    ring.style.left = `${event.clientX - radius}px`;
-    ring.style.top = `${event.clientY - radius}px`;
-    ring.style.width = ring.style.height = `${2 * radius}px`;
+    const { radius } = this.own;
+    this.ring.hidden = event.target !== this.view.canvas && this.pointer === null;
+    Object.assign(this.ring.style, { left: `${event.clientX - radius}px`, top: `${event.clientY - radius}px` });
+    this.ring.style.width = this.ring.style.height = `${2 * radius}px`;
     if (event.pointerId !== this.pointer) return;
     event.stopImmediatePropagation();
     this.path.push(this.place(event));
@@ -88,28 +65,26 @@ export class Brush {
   take(event) {
     if (!this.paints(event)) return;
     event.stopImmediatePropagation();
-    this.tell("part", true, [this.place(event)]);
+    this.tell([this.place(event)], this.own.how);
   }
 
   place({ clientX, clientY }) {
-    const { left, top } = this.stage.above.canvas.getBoundingClientRect();
-    return [clientX - left, clientY - top];
+    return [clientX, clientY];
   }
 
   send() {
     clearTimeout(this.later);
     this.later = null;
     if (this.path === null) return;
-    this.tell("stroke", this.first, this.path);
+    this.tell(this.path);
     this.first = false;
     this.path = this.path.slice(-1); // the next piece goes on from here
   }
 
-  tell(kind, first, path) {
-    if (this.socket?.readyState !== WebSocket.OPEN) return;
-    const { canvas, camera } = this.stage.above;
-    const size = [canvas.clientWidth, canvas.clientHeight];
-    const { fov, near, matrixWorld } = camera;
-    this.socket.send(JSON.stringify({ kind, first, path, size, fov, near, matrix: [...matrixWorld.elements] }));
+  tell(path, how = null) {
+    const { camera } = this.view;
+    const { part, radius, through } = this.own;
+    const look = { matrix: camera.matrixWorld.elements, fov: camera.fov, near: camera.near, size: [innerWidth, innerHeight] };
+    this.say({ kind: "brush", path, how, first: this.first, part, radius, through, ...look });
   }
 }

@@ -4,8 +4,8 @@ import { build } from "esbuild";
 import { createHash } from "node:crypto";
 import { readFile } from "node:fs/promises";
 
-const OWN = "brush.js build.js bundle.js film.glsl.js film.js gaussians.js live.js main.js playback.js sorter.js view.js".split(" ");
-OWN.push(..."dial.js page.js settings.js".split(" ").map((name) => `live_web/${name}`));
+const OWN = "brush.js build.js bundle.js film.glsl.js film.js gaussians.js live.js main.js panel.js playback.js sorter.js tunnel.js view.js".split(" ");
+OWN.push("live_web/page.js");
 const SOLVER = "aero.js block.js body.js modal.js solver.js webgpu.js wind.js worker.js"
   .split(" ")
   .map((name) => `live_web/${name}`);

@@ -1,6 +1,7 @@
 // A film of Gaussians: splats once, the displacement of grid nodes per frame. See docs/web.md.
 import { Frames } from "./bundle.js";
 import { reader } from "./gaussians.js";
+import { button, element } from "./panel.js";
 import { View } from "./view.js";
 
 // `read(name)` gives a part of the file once it is there; `tell(sentence)` is called if the file ends too early.
@@ -8,17 +9,21 @@ export async function play(read, tell) {
   const head = JSON.parse(new TextDecoder().decode(await read("head")));
   const stencils = reader(await read("stencils"))(Uint32Array, 27 * head.stencils);
   const frames = new Frames(head);
-  const element = (name) => document.getElementById(name);
 
   const state = { frame: -1, time: 0, playing: true, last: null };
-  const view = new View(element("canvas"), head, stencils, read, (_kind, bytes, count) => frames.add(bytes, count));
+  const view = new View(element("canvas"), { takeOther: (_kind, bytes, count) => frames.add(bytes, count) });
   const { drawing } = view;
-  await view.open();
+  await view.open(head, stencils, read);
+  view.aimAsWritten();
 
-  const slider = element("time");
-  const button = element("play");
-  const loop = element("loop");
-  slider.max = String(head.frames - 1);
+  const play = button("play", "❚❚", "Pause", () => setPlaying(!state.playing));
+  const slider = Object.assign(document.createElement("input"), { id: "time", type: "range", min: 0, max: head.frames - 1, value: 0 });
+  slider.setAttribute("aria-label", "Time");
+  const clock = Object.assign(document.createElement("span"), { id: "clock" });
+  const loop = button("loop", "⟳", "Loop", () => loop.setAttribute("aria-pressed", String(!looping())));
+  loop.setAttribute("aria-pressed", "true");
+  element("bar").append(play, slider, clock, loop);
+  const looping = () => loop.getAttribute("aria-pressed") === "true";
 
   function show(frame) {
     if (frame === state.frame) return;
@@ -26,7 +31,7 @@ export async function play(read, tell) {
     state.frame = frame;
     slider.value = String(frame);
     const seconds = (count) => (count * head.frame_dt).toFixed(2);
-    element("clock").textContent = `${seconds(frame)} / ${seconds(head.frames - 1)} s`;
+    clock.textContent = `${seconds(frame)} / ${seconds(head.frames - 1)} s`;
   }
 
   // Show a frame, or the last one that has come so far.
@@ -40,23 +45,18 @@ export async function play(read, tell) {
     if (on && state.frame === head.frames - 1) seek(0);
     state.playing = on;
     state.last = null;
-    button.textContent = on ? "❚❚" : "▶";
-    button.setAttribute("aria-label", on ? "Pause" : "Play");
+    play.textContent = on ? "❚❚" : "▶";
+    play.setAttribute("aria-label", on ? "Pause" : "Play");
   }
 
   slider.addEventListener("input", () => {
     setPlaying(false);
     seek(Number(slider.value));
   });
-  button.addEventListener("click", () => setPlaying(!state.playing));
-  loop.addEventListener("click", () =>
-    loop.setAttribute("aria-pressed", String(loop.getAttribute("aria-pressed") !== "true")),
-  );
   window.addEventListener("keydown", (event) => {
-    if (event.key === " " && event.target !== button && event.target !== loop) {
-      event.preventDefault();
-      setPlaying(!state.playing);
-    }
+    if (event.key !== " " || /** @type {Element} */ (event.target).closest?.("button")) return;
+    event.preventDefault();
+    setPlaying(!state.playing);
   });
 
   function tick(now) {
@@ -65,7 +65,7 @@ export async function play(read, tell) {
     state.time += state.last === null ? 0 : Math.min(now - state.last, 250) / 1000;
     state.last = now;
     if (frames.loaded < head.frames) state.time = Math.min(state.time, (frames.loaded - 1) * head.frame_dt);
-    if (state.time >= end && loop.getAttribute("aria-pressed") !== "true") {
+    if (state.time >= end && !looping()) {
       seek(head.frames - 1);
       setPlaying(false);
     } else {
@@ -76,7 +76,8 @@ export async function play(read, tell) {
 
   show(0);
   setPlaying(true);
-  const complete = view.begin(tick);
+  view.begin(tick);
+  const complete = view.takeRest();
   complete.catch((error) => {
     console.info(error.message);
     tell(error.message);

@@ -276,7 +276,7 @@ export class Drawing {
 
   // Leave out the faint rims of Gaussians, which cost most, or not.
   rough(on) {
-    this.spark.maxStdDev = on ? Math.sqrt(6) : 3;
+    if (this.spark) this.spark.maxStdDev = on ? Math.sqrt(6) : 3;
   }
 
   // Give up the Gaussians that are drawn.

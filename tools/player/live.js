@@ -1,276 +1,265 @@
-// The live page: draws the states of a running simulation on a canvas below that of viser. See docs/live.md.
-import * as THREE from "three";
+// The live page: draws the states of a simulation that runs on a server, and steers it. See docs/live.md.
 import { Brush } from "./brush.js";
-import { Drawing, writeNodes } from "./gaussians.js";
-import { Playback } from "./playback.js";
+import { blocks } from "./bundle.js";
+import { reader, writeNodes } from "./gaussians.js";
+import { button, element, make } from "./panel.js";
+import { Tunnel } from "./tunnel.js";
+import { View } from "./view.js";
 
 const SLOW = 3; // pictures a second; a browser that draws fewer gets pictures from the server
-const PATIENCE = 4; // s, until that is decided
-const SIZES = [1, 0.75, 0.5, 0.35]; // parts of the window's pixels along each side, where the graphics card is slow
+const PATIENCE = 4000; // ms, until that is decided
 const AGAIN = 1000; // ms until a connection that broke is opened again
 
-// ---- messages, see gaussian_swaying/viewer/states.py
+// ---- messages, see gaussian_swaying/viewer/server.py
 
 function unpack(data) {
   const bytes = new Uint8Array(data);
   const size = new DataView(data).getUint32(0, true);
-  return [JSON.parse(new TextDecoder().decode(bytes.subarray(4, 4 + size))), bytes.slice(4 + size)];
+  return { ...JSON.parse(new TextDecoder().decode(bytes.subarray(4, 4 + size))), rest: bytes.slice(4 + size) };
 }
 
 // The displacement of all nodes, four numbers each.
-function readState(head, rest) {
-  const near = new Int16Array(rest.buffer, 0, 3 * head.nodes);
-  const moved = new Float32Array(4 * head.nodes);
+function readState({ nodes, rest, step }) {
+  const near = new Int16Array(rest.buffer, 0, 3 * nodes);
+  const moved = new Float32Array(4 * nodes);
   const far = rest.slice(near.byteLength).buffer;
-  writeNodes(moved, near, { rows: new Int32Array(far), values: new Float32Array(far) }, head.step);
-  return { time: head.time, moved };
+  writeNodes(moved, near, { rows: new Int32Array(far), values: new Float32Array(far) }, step);
+  return moved;
 }
 
-// ---- the canvas
-
-class Stage {
+class Live {
   constructor() {
-    this.playback = new Playback();
-    this.canvas = document.createElement("canvas");
-    Object.assign(this.canvas.style, { position: "absolute", inset: 0, width: "100%", height: "100%" });
-    Object.assign(this.canvas.style, { zIndex: -1, pointerEvents: "none" });
-    this.canvas.id = "wind";
-    this.camera = new THREE.PerspectiveCamera();
-    this.above = null; // viser's canvas, and its camera
-    this.world = null; // from viser's world to that of the Gaussians
-    this.drawing = null;
-    this.socket = null;
-    this.brush = new Brush(this);
-    this.failed = null; // why this browser does not draw
+    const canvas = element("canvas");
+    const tested = document.createElement("canvas").getContext("webgl2");
+    tested?.getExtension("WEBGL_lose_context")?.loseContext();
+    this.failed = tested ? null : "this browser has no WebGL2"; // why this browser does not draw
     Object.assign(this, { slow: SLOW, patience: PATIENCE });
-    this.scene = this.motion = null;
-    this.on = false;
-    this.left = 0; // pictures that have to be drawn
-    this.drawn = []; // when, of the last seconds [s]
-    this.count = 0; // pictures that were drawn
-    this.size = 0; // index in SIZES
-    this.asked = false; // whether the last tick drew
-    this.lately = { time: 0, pictures: 0 }; // time that pictures took [s], for the size
-    this.long = { time: 0, pictures: 0 }; // the same, until the server is asked to draw
+    this.view = new View(canvas, { draws: tested !== null });
+    const action = (kind, text, label) => button(kind, text, label, () => this.say({ kind }));
+    const further = [action("step", "Step", "Advance by one step"), action("undo", "Undo", "Take the last change back")];
+    this.tunnel = new Tunnel(this.view, (message) => this.say(message), (name, value) => this.set(name, value), further);
+    this.brush = new Brush(this.view, (message) => this.say(message));
+    this.own = { show: "color", server: false, part: "held", radius: 20, through: false, how: "what is connected" };
+    this.on = false; // whether it draws
+    this.figures = this.painting = this.panel = null;
+    this.count = 0; // messages with bytes that were taken in
+    this.lens = "";
+    this.since = null; // when it began to draw slowly
+    this.file = make("input", { type: "file", hidden: true });
+    this.file.addEventListener("change", () => this.file.files[0] && this.load(this.file.files[0]));
+    document.body.append(this.file);
+    addEventListener("keydown", (event) => {
+      if (event.key === "z" && (event.ctrlKey || event.metaKey)) this.say({ kind: "undo" });
+    });
+    document.addEventListener("visibilitychange", () => this.tellShown());
+    this.connect();
+    this.view.begin((now) => this.tick(now));
   }
 
   // ---- the server
 
-  // Ask for the states; called by the server, with the key of this browser.
-  join(key) {
-    if (key !== this.key) this.brush.join(key);
-    this.key = key;
-    this.socket?.close();
-    if (this.failed) return;
-    const socket = new WebSocket(`${location.origin.replace("http", "ws")}/states?key=${key}`);
+  connect() {
+    const socket = new WebSocket(`${location.origin.replace("http", "ws")}/socket`);
     socket.binaryType = "arraybuffer";
-    this.socket = socket;
-    let count = 0;
+    Object.assign(this, { socket, count: 0, lens: "" });
+    let queue = Promise.resolve();
+    socket.onopen = () => this.tellShown();
     socket.onmessage = ({ data }) => {
-      try {
-        this.take(...unpack(data));
-      } catch (error) {
-        return this.fail(error.message);
-      }
-      const answer = new DataView(new ArrayBuffer(8));
-      answer.setUint32(0, ++count, true);
-      answer.setFloat32(4, this.rate(), true);
-      socket.send(answer.buffer);
+      queue = queue.then(() => this.take(typeof data === "string" ? JSON.parse(data) : unpack(data))).catch((error) => this.fail(error.message));
+      if (typeof data !== "string") queue.then(() => socket === this.socket && this.say({ kind: "ack", count: ++this.count, rate: this.on ? this.view.rate ?? 0 : 0 }));
     };
     socket.onclose = () => {
-      if (socket !== this.socket) return;
-      this.hide();
-      setTimeout(() => socket === this.socket && !this.failed && this.key === key && this.join(key), AGAIN);
+      this.tell("The program does not answer: it may have ended.");
+      setTimeout(() => this.connect(), AGAIN);
     };
+  }
+
+  say(message) {
+    if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
+  }
+
+  tellShown() {
+    this.say({ kind: "shown", show: this.own.show, server: this.own.server || this.failed !== null, hidden: document.hidden });
   }
 
   // Let the server draw from now on.
   fail(why) {
     console.info(`The server draws: ${why}.`);
     this.failed = why;
-    this.hide();
-    this.drawing?.clear();
-    this.socket?.close();
-  }
-
-  hide() {
     this.on = false;
-    this.canvas.style.visibility = "hidden";
-    this.playback.clear();
-    this.scene = null;
+    this.tellShown();
   }
 
-  take(head, rest) {
-    if (head.kind === "off") return this.hide();
-    if (head.kind === "look") return this.drawing.light(head);
-    if (head.kind === "colours") {
-      const changed = new Uint32Array(rest.buffer, 0, head.count);
-      return this.drawing.recolour(changed.map((i) => this.place[i]), rest.subarray(changed.byteLength));
+  async take(message) {
+    const { drawing, canvas } = this.view;
+    const { kind } = message;
+    if (kind === "figures") this.showFigures(message);
+    else if (kind === "panel") this.showPanel((this.panel = message));
+    else if (kind === "painting") this.showPanel(this.panel, (this.painting = message));
+    else if (kind === "grabbed") this.tunnel.grabbed(message);
+    else if (kind === "file") this.download(message.name);
+    else if (kind === "look") drawing.light(message);
+    else if (kind === "colours") drawing.recolour(new Uint32Array(message.rest.buffer, 0, message.count), message.rest.subarray(4 * message.count));
+    else if (kind === "scene") await this.open();
+    else if (kind === "picture") {
+      const picture = await createImageBitmap(new Blob([message.rest], { type: "image/jpeg" }));
+      const shown = element("picture");
+      Object.assign(shown, { width: picture.width, height: picture.height, hidden: false });
+      shown.getContext("2d").drawImage(picture, 0, 0);
+      this.on = false;
+      canvas.style.opacity = "0";
+      element("message").hidden = true;
+    } else if (kind === "state" && !this.failed && message.nodes === this.view.head?.nodes) {
+      this.tunnel.take({ ...message, moved: readState(message) });
+      this.on = true;
+      canvas.style.opacity = "1";
+      element("picture").hidden = element("message").hidden = true;
     }
-    if (head.kind === "scene") {
-      this.drawing ??= new Drawing(this.canvas, (pictures) => (this.left = Math.max(this.left, pictures)));
-      const last = head.moving + head.still;
-      const [order, stencils] = [new Uint32Array(head.head.count), new Uint32Array(27 * head.head.stencils)];
-      new Uint8Array(order.buffer).set(rest.subarray(last, last + order.byteLength));
-      new Uint8Array(stencils.buffer).set(rest.subarray(last + order.byteLength));
-      this.place = new Uint32Array(order.length); // of each Gaussian of the splat among those that are drawn
-      order.forEach((i, k) => (this.place[i] = k));
-      this.drawing.show(head.head, stencils);
-      this.drawing.add("moving", rest.subarray(0, head.moving));
-      this.drawing.add("still", rest.subarray(head.moving, last));
-      this.drawing.follow();
-      this.world = new THREE.Matrix4().fromArray(head.world);
-      this.scene = head.head;
-      this.playback.clear();
-      return;
+  }
+
+  async open() {
+    const file = blocks("scene.sway");
+    const next = async () => (await file.next()).value;
+    const head = JSON.parse(new TextDecoder().decode(await next()));
+    const stencils = reader(await next())(Uint32Array, 27 * head.stencils);
+    this.tunnel.playback.clear();
+    await this.view.open(head, stencils, next);
+    for (let index = head.start; index < head.parts.length; index++) await this.view.take(index);
+    this.view.whole = true;
+    this.view.drawing.follow();
+    this.view.resize();
+  }
+
+  // ---- what it shows
+
+  tell(sentence) {
+    element("note").textContent = sentence;
+    element("note").hidden = !sentence;
+  }
+
+  showFigures(figures) {
+    this.figures = figures;
+    const { loading, notice, problem, broken, paused, speed, rate, pictures, recorded, stretch } = figures;
+    const remedy = broken ? " Press Reset to start again, or Undo." : "";
+    this.tell([problem && problem + remedy, notice].filter(Boolean).join(" "));
+    element("loading").hidden = !loading;
+    if (loading) [element("loading").value, element("figures").textContent] = [loading.share, `${loading.what} …`];
+    if (paused === undefined) return;
+    this.tunnel.showPlaying(!paused);
+    this.tunnel.speed = speed;
+    this.tunnel.slow.setAttribute("aria-pressed", String(speed < 1));
+    element("undo").disabled = figures.undo === 0;
+    const lines = [`${pictures} pictures a second, ${paused ? "paused" : `${rate.toPrecision(2)} × real time`}`];
+    if (recorded !== null) lines.push(`recording ${recorded.toFixed(1)} s`);
+    if (!loading) element("figures").textContent = lines.join(", ");
+    element("figures").title = `t = ${figures.time.toFixed(2)} s; ${figures.substeps} substeps in a step of ${figures.step.toPrecision(3)} s; stretch ${stretch[0].toFixed(2)} to ${stretch[1].toFixed(2)}`;
+  }
+
+  showPanel(panel) {
+    if (!panel) return;
+    const { own, painting } = this;
+    this.tunnel.metre = panel.metre;
+    const camera = JSON.stringify(panel.camera);
+    if (camera !== this.camera) this.view.aim(panel.camera); // another object
+    this.camera = camera;
+    const toggle = (name, label, value, hint = "") => ({ kind: "toggle", name, label, value, hint });
+    const act = (name, label, hint = "") => ({ kind: "button", name, label, hint });
+    const groups = [...panel.groups];
+    if (painting) {
+      const names = painting.parts.map(({ name }) => name);
+      if (!names.includes(own.part)) own.part = names.find((name) => name.startsWith("held")) ?? names[0];
+      const paint = [toggle("paint", "Paint", painting.on, "The object rests meanwhile; Shift turns the view")];
+      if (painting.on)
+        paint.push(
+          { kind: "choice", name: "part", label: "Paint as", options: names, value: own.part },
+          { kind: "range", name: "radius", label: "Radius", unit: "pixels", low: 2, high: 200, log: true, value: own.radius },
+          toggle("through", "Hidden, too", own.through, "The brush reaches through the object"),
+          { kind: "choice", name: "how", label: "Double click", options: panel.together, value: own.how },
+        );
+      if (painting.undo) paint.push(act("take_back", "Undo the stroke"));
+      if (painting.apply) paint.push(act("apply", "Apply the parts", "The simulation takes them, from rest"));
+      if (painting.save) paint.push(act("parts.npz", "Save the parts", "A file for scene.parts"));
+      groups.push({ name: "Paint parts", controls: paint, shut: true });
     }
-    if (head.motion !== this.motion) this.playback.clear();
-    this.motion = head.motion;
-    this.playback.add(readState(head, rest), performance.now() / 1000, head.ended);
-    this.stale = true;
-    this.on = true;
-    this.canvas.style.visibility = "visible";
+    const files = [
+      act("restore", "Reset to the configuration", "Wind, material, pins, grid and light as they were at first"),
+      act("record", this.figures?.recorded == null ? "Record a video" : "Stop recording", "It shows simulated time"),
+      act("live.yaml", "Save the configuration", "For gaussian-swaying sim --config"),
+      act("load", panel.elsewhere ? "Load a splat" : "Load a splat or a configuration"),
+    ];
+    groups.push({ name: "Files", controls: files, shut: true });
+    this.tunnel.show(groups);
+    this.brush.set({ on: painting?.on ?? false, ...own });
+    this.showLegend();
+    if (this.hash !== undefined) return;
+    this.hash = location.hash; // once the controls are there
+    this.tunnel.apply(this.hash);
+    this.tunnel.changed.clear();
+  }
+
+  showLegend() {
+    const scale = this.panel.legends[this.own.show];
+    const rows = (this.painting?.on ? this.painting.parts : []).map(({ name, tint, count }) => {
+      const square = make("i");
+      square.style.background = tint ? `rgb(${tint})` : "none";
+      return make("div", {}, square, `${name}: ${count.toLocaleString("en")}`);
+    });
+    if (scale) {
+      const bar = make("b");
+      bar.style.background = `linear-gradient(to right, ${scale.colours.map((colour) => `rgb(${colour})`)})`;
+      const [middle, high] = [0.5 * scale.high, scale.high].map((value) => value.toPrecision(3));
+      rows.push(make("div", { textContent: `${scale.name} [${scale.unit}]` }), bar, make("div", { className: "ends", innerHTML: `<span>0</span><span>${middle}</span><span>${high} and more</span>` }));
+    }
+    element("legend").replaceChildren(...rows);
+    element("legend").hidden = rows.length === 0;
+  }
+
+  // ---- what the controls do
+
+  set(name, value) {
+    if (name in this.own) {
+      this.own[name] = value;
+      this.tunnel.changed.delete(name);
+      this.brush.set({ on: this.painting?.on ?? false, ...this.own });
+      this.showLegend();
+      this.tellShown();
+    } else if (name === "paint") this.say({ kind: "paint", on: value });
+    else if (["take_back", "apply", "record", "restore"].includes(name)) this.say({ kind: name });
+    else if (name === "load") this.file.click();
+    else if (["parts.npz", "live.yaml"].includes(name)) this.download(name);
+    else this.say({ kind: "set", name, value });
+    if (value === null || name === "paint") this.tunnel.changed.delete(name);
+  }
+
+  download(name) {
+    make("a", { href: `save/${name}`, download: name }).click();
+  }
+
+  async load(file) {
+    this.file.value = "";
+    const answer = await fetch(`load?name=${encodeURIComponent(file.name)}`, { method: "POST", body: file });
+    if (!answer.ok) this.tell(await answer.text());
   }
 
   // ---- pictures
 
-  // Called when viser has drawn.
-  follow(renderer, camera) {
-    const above = renderer.domElement;
-    if (!above.isConnected || above === this.canvas) return;
-    if (this.canvas.parentElement !== above.parentElement) {
-      above.parentElement.prepend(this.canvas);
-      above.toBlob = (...given) => this.together(above).toBlob(...given); // viser's button that saves the picture
+  tick(now) {
+    const { view, tunnel } = this;
+    if (this.on) tunnel.tick(now);
+    const { camera } = view;
+    const size = [innerWidth, innerHeight];
+    const lens = JSON.stringify([camera.matrixWorld.elements, camera.fov, size]);
+    if (this.panel && lens !== this.lens && this.socket.readyState === WebSocket.OPEN && now - (this.looked ?? 0) > 30) {
+      camera.updateMatrixWorld();
+      this.say({ kind: "view", matrix: camera.matrixWorld.elements, fov: camera.fov, near: camera.near, size });
+      Object.assign(this, { lens, looked: now });
     }
-    this.above = { canvas: above, camera };
-    if (this.on) this.look();
-  }
-
-  // Take over viser's camera.
-  look() {
-    const { camera: seen } = this.above;
-    const { camera } = this;
-    const before = camera.matrixWorld.clone();
-    const lens = [camera.fov, camera.aspect, camera.near];
-    const size = new THREE.Vector3();
-    new THREE.Matrix4().multiplyMatrices(this.world, seen.matrixWorld).decompose(camera.position, camera.quaternion, size);
-    Object.assign(camera, { fov: seen.fov, aspect: seen.aspect, near: seen.near * size.x, far: 1000 });
-    camera.updateMatrixWorld();
-    if (before.equals(camera.matrixWorld) && [camera.fov, camera.aspect, camera.near].every((x, i) => x === lens[i])) return;
-    camera.updateProjectionMatrix();
-    this.drawing.wake(2); // it is sorted for the picture after
-  }
-
-  resize(scale) {
-    const { clientWidth: width, clientHeight: height } = this.above.canvas;
-    const ratio = Math.min(window.devicePixelRatio, 2) * scale;
-    const wanted = [Math.max(1, Math.floor(width * ratio)), Math.max(1, Math.floor(height * ratio))];
-    if (this.canvas.width === wanted[0] && this.canvas.height === wanted[1]) return;
-    this.drawing.renderer.setSize(...wanted, false);
-    this.drawing.wake(1);
-  }
-
-  tick(milliseconds) {
-    const { playback, drawing } = this;
-    if (!this.on || !this.above || playback.newest === null) return; // another scene has no state yet
-    const now = milliseconds / 1000;
-    const before = playback.shown;
-    playback.advance(now);
-    if (this.stale || playback.shown !== before) {
-      this.stale = false;
-      drawing.move((data) => playback.write(data));
-      this.moving = now;
-    }
-    const still = now - (this.moving ?? 0) > 0.3;
-    this.resize(still ? 1 : SIZES[this.size]);
-    this.look();
-    if (!drawing.ready) drawing.wake(1);
-    this.adapt(now, still);
-    if (this.left === 0) return;
-    this.left--;
-    drawing.render(this.camera);
-    this.count++;
-    this.drawn.push(now);
-    while (now - this.drawn[0] > 2) this.drawn.shift();
-  }
-
-  // Fewer pixels if pictures take long; after all, those of the server.
-  adapt(now, still) {
-    const took = now - (this.drawn[this.drawn.length - 1] ?? now); // since the last picture
-    const busy = this.left > 0 && this.asked && !still && !document.hidden;
-    this.asked = this.left > 0;
-    if (!busy || took === 0) return;
-    for (const sum of [this.lately, this.long]) {
-      sum.time += took;
-      sum.pictures++;
-    }
-    if (this.lately.time > 1) {
-      if (this.lately.pictures / this.lately.time < 20 && this.size < SIZES.length - 1) this.size++;
-      this.lately = { time: 0, pictures: 0 };
-    }
-    if (this.long.time > this.patience) {
-      const slow = this.long.pictures / this.long.time < this.slow;
-      if (slow) this.fail("this browser draws slowly, mostly for lack of a graphics card");
-      this.long = { time: 0, pictures: 0 };
-    }
-  }
-
-  // Pictures a second.
-  rate() {
-    const now = performance.now() / 1000;
-    return this.drawn.filter((at) => now - at < 2).length / 2;
-  }
-
-  // What is seen: our picture below that of viser.
-  together(above) {
-    const both = document.createElement("canvas");
-    [both.width, both.height] = [above.width, above.height];
-    const pen = both.getContext("2d");
-    if (this.on) {
-      this.drawing.render(this.camera);
-      pen.drawImage(this.canvas, 0, 0, both.width, both.height);
-    }
-    pen.drawImage(above, 0, 0);
-    return both;
-  }
-
-  // Centres of the Gaussians as they are drawn, in units of the object's size; for tests.
-  positions() {
-    return this.drawing.positions();
+    const slow = this.on && !document.hidden && view.lately.pictures > 0 && view.rate !== undefined && view.rate < this.slow;
+    if (!slow) this.since = null;
+    else if (now - (this.since ??= now) > this.patience) this.fail("this browser draws slowly, mostly for lack of a graphics card");
   }
 }
 
-// Without WebGL2, viser shows neither pictures nor controls.
-function tellWhatLacks(stage) {
-  stage.failed = "this browser has no WebGL2";
-  const message = document.createElement("p");
-  message.textContent =
-    "This page needs WebGL2, which this browser lacks or has switched off: switch on hardware acceleration in its " +
-    "settings, or open the page in another browser. Without a graphics card, start Chromium with --enable-unsafe-swiftshader.";
-  Object.assign(message.style, { position: "fixed", inset: "40% 0 auto", zIndex: 1000, margin: "auto", maxWidth: "36em" });
-  Object.assign(message.style, { padding: "1em", font: "16px/1.5 system-ui, sans-serif", color: "#222", background: "#fff" });
-  addEventListener("DOMContentLoaded", () => document.body.append(message));
-}
-
-// Called before viser's program starts, to see its pictures and its camera: three.js announces each of its renderers.
-export function watch() {
-  const stage = new Stage();
-  window.wind = stage;
-  const tested = document.createElement("canvas").getContext("webgl2");
-  if (!tested) return tellWhatLacks(stage);
-  tested.getExtension("WEBGL_lose_context")?.loseContext();
-  window.__THREE_DEVTOOLS__ ??= new EventTarget();
-  window.__THREE_DEVTOOLS__.addEventListener("observe", ({ detail: renderer }) => {
-    if (!renderer.isWebGLRenderer || renderer.domElement === stage.canvas) return;
-    const draw = renderer.render;
-    renderer.render = function (scene, camera, ...rest) {
-      draw.call(this, scene, camera, ...rest);
-      if (camera.isPerspectiveCamera && this.getRenderTarget() === null) stage.follow(this, camera);
-    };
-  });
-  const tick = (now) => {
-    requestAnimationFrame(tick);
-    stage.tick(now);
-  };
-  requestAnimationFrame(tick);
+export function live() {
+  window.wind = new Live();
 }

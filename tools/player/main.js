@@ -1,10 +1,12 @@
 // What pages find: window.playFilm for films, window.watchWind for the live page, window.swayInWind for the page without a server.
 import { dyno, SparkRenderer, SplatGenerator } from "@sparkjsdev/spark";
 import { DataTexture, FloatType, Group, PerspectiveCamera, RGBAFormat, RGBAIntegerFormat, Scene, UnsignedIntType, Vector3, Vector4, WebGLRenderer } from "three";
+import { blocks } from "./bundle.js";
 import { play } from "./film.js";
 import { positionsOf } from "./gaussians.js";
-import { watch } from "./live.js";
+import { live } from "./live.js";
 import { sway } from "./live_web/page.js";
+import { element } from "./panel.js";
 import { Playback } from "./playback.js";
 import { makeSorter } from "./sorter.js";
 
@@ -12,4 +14,19 @@ import { makeSorter } from "./sorter.js";
 const three = { DataTexture, FloatType, Group, PerspectiveCamera, RGBAFormat, RGBAIntegerFormat, Scene, UnsignedIntType, Vector3, Vector4, WebGLRenderer };
 const engine = { three, spark: { dyno, SparkRenderer, SplatGenerator }, makeSorter, positionsOf };
 
-Object.assign(window, { engine, playFilm: play, watchWind: watch, swayInWind: sway, Playback });
+// Plays a .sway file at an address.
+async function playFile(url) {
+  const file = blocks(url);
+  const message = element("message");
+  const read = async () => {
+    const { done, value } = await file.next();
+    if (done) throw new Error(`${url} is cut short`);
+    return value;
+  };
+  await play(read, (sentence) => Object.assign(element("note"), { textContent: sentence, hidden: false })).then(
+    () => (message.hidden = true),
+    (error) => (message.textContent = error.message),
+  );
+}
+
+Object.assign(window, { engine, playFile, playFilm: play, watchWind: live, swayInWind: sway, Playback });

@@ -1,14 +1,17 @@
-// What one sees of a file with Gaussians: the canvas, the camera that mouse and fingers move, and the parts of the file as they come.
+// What one sees: the canvas, the camera that mouse and fingers move, and the parts of a file of Gaussians as they come.
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { Drawing } from "./gaussians.js";
 
 const COARSE = 1 / 4; // of the window's pixels along each side, until all Gaussians have come
+const PIXELS = [1, 0.75, 0.5, 0.35]; // the same, where drawing is slow
+const FEW = 20; // pictures a second
+const WINDOW = 1500; // ms, over which they are counted
 
 // How far the moving Gaussians reach to the left and right of the first view, as a tangent.
-function reach(head, layer) {
-  const eye = new THREE.Vector3(...head.camera.eye);
-  const axis = new THREE.Vector3(...head.camera.target).sub(eye).normalize();
+function reach(camera, layer) {
+  const eye = new THREE.Vector3(...camera.eye);
+  const axis = new THREE.Vector3(...camera.target).sub(eye).normalize();
   const right = new THREE.Vector3().crossVectors(axis, new THREE.Vector3(0, 0, 1)).normalize();
   const ray = new THREE.Vector3();
   let most = 0;
@@ -22,21 +25,50 @@ function reach(head, layer) {
 }
 
 export class View {
-  // `takeOther(kind, bytes, count)` gets the parts of the file that are no Gaussians.
-  constructor(canvas, head, stencils, read, takeOther = () => {}) {
-    Object.assign(this, { canvas, head, read, takeOther });
+  // `takeOther(kind, bytes, count)` gets the parts of the file that are no Gaussians; `draws` is false without WebGL2.
+  constructor(canvas, { takeOther = (_kind, _bytes, _count) => {}, draws = true } = {}) {
+    Object.assign(this, { canvas, takeOther });
     this.left = 3; // pictures that have to be drawn
     this.drawn = 0;
     this.first = null; // when the first picture was there [s after the page was asked for]
     this.fence = null;
-    this.whole = head.parts.length === head.start;
-    this.scale = 1; // of the window's pixels along each side
-    this.drawing = new Drawing(canvas, (pictures) => this.wake(pictures));
-    this.drawing.show(head, stencils);
+    this.whole = true;
+    this.drawing = draws ? new Drawing(canvas, (pictures) => this.wake(pictures)) : null;
+    this.camera = new THREE.PerspectiveCamera(40, 1, 0.01, 200);
+    this.camera.up.set(0, 0, 1);
+    this.controls = new OrbitControls(this.camera, canvas);
+    Object.assign(this.controls, { enableDamping: true, minDistance: 0.1, maxDistance: 20 });
+    this.controls.addEventListener("change", () => this.wake(3));
+    this.lately = { since: 0, pictures: 0, size: 0 };
+    addEventListener("resize", () => this.resize());
   }
 
   wake(pictures) {
     this.left = Math.max(this.left, pictures);
+  }
+
+  // Look from the camera of a head; `wanted` is the tangent that a narrow window still shows to each side.
+  aim(camera, wanted = Infinity) {
+    this.aimed = { ...camera, wanted };
+    this.camera.position.set(...camera.eye);
+    this.controls.target.set(...camera.target);
+    this.controls.update();
+    this.resize();
+  }
+
+  // Read what the first picture of a file needs.
+  async open(head, stencils, read) {
+    Object.assign(this, { head, read });
+    this.whole = head.parts.length === head.start;
+    this.drawing.show(head, stencils);
+    for (let index = 0; index < head.start; index++) await this.take(index);
+  }
+
+  // Look from where the file says, with room to swing.
+  aimAsWritten() {
+    const { camera } = this.head;
+    const distance = new THREE.Vector3(...camera.eye).distanceTo(new THREE.Vector3(...camera.target));
+    this.aim(camera, reach(camera, this.drawing.splat.layers.moving) + 0.3 / distance);
   }
 
   async take(index) {
@@ -46,56 +78,54 @@ export class View {
     else this.takeOther(kind, bytes, last - first);
   }
 
-  // Read what the first picture needs, and set up the camera.
-  async open() {
-    const { head, canvas, drawing } = this;
-    for (let index = 0; index < head.start; index++) await this.take(index);
-    const camera = new THREE.PerspectiveCamera(head.camera.fov, 1, 0.01, 200);
-    camera.up.set(0, 0, 1);
-    camera.position.set(...head.camera.eye);
-    const controls = new OrbitControls(camera, canvas);
-    controls.target.set(...head.camera.target);
-    controls.enableDamping = true;
-    controls.minDistance = 0.1;
-    controls.maxDistance = 20;
-    controls.addEventListener("change", () => this.wake(3));
-    controls.update();
-    Object.assign(this, { camera, controls });
-    this.wanted = reach(head, drawing.splat.layers.moving) + 0.3 / camera.position.distanceTo(controls.target); // and room to swing
-    window.addEventListener("resize", () => this.resize());
-    this.resize();
-  }
-
   resize() {
-    const { camera, head, whole, drawing } = this;
+    if (!this.aimed) return;
+    const { camera, whole, drawing, aimed } = this;
     const [width, height] = [window.innerWidth, window.innerHeight];
-    drawing.rough(!whole);
-    drawing.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2) * (whole ? this.scale : COARSE));
-    drawing.renderer.setSize(width, height);
-    const upright = Math.tan((head.camera.fov * Math.PI) / 360);
-    const across = Math.min(upright * head.camera.aspect, this.wanted); // what a narrow window still shows
+    if (drawing) {
+      drawing.rough(!whole);
+      drawing.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2) * (whole ? PIXELS[this.lately.size] : COARSE));
+      drawing.renderer.setSize(width, height);
+    }
+    const upright = Math.tan((aimed.fov * Math.PI) / 360);
+    const across = Math.min(upright * aimed.aspect, aimed.wanted); // what a narrow window still shows
     camera.aspect = width / height;
     camera.fov = (2 * Math.atan(Math.max(across / camera.aspect, upright)) * 180) / Math.PI;
     camera.updateProjectionMatrix();
     this.wake(3);
   }
 
-  // Draw from now on; `tick(now)` is called before each picture. Returns a promise that all of the file has come.
+  // Draw from now on; `tick(now)` is called before each picture.
   begin(tick) {
-    this.drawing.begin(this.camera);
-    this.drawing.renderer.setAnimationLoop((now) => {
+    if (this.drawing?.spark) this.drawing.begin(this.camera);
+    const loop = (now) => {
+      requestAnimationFrame(loop);
       tick(now);
       this.controls.update();
+      if (!this.drawing?.spark) return;
+      this.adapt(now);
       if (!this.drawing.ready) this.wake(1);
       if (this.left > 0) {
         this.left--;
         this.drawing.render(this.camera);
         this.drawn++;
+        this.lately.pictures++;
       }
       this.timeFirst();
-    });
-    this.complete = this.takeRest();
-    return this.complete;
+    };
+    requestAnimationFrame(loop);
+  }
+
+  // Fewer pixels where drawing is slow.
+  adapt(now) {
+    const { lately } = this;
+    if (this.left === 0) Object.assign(lately, { since: now, pictures: 0 }); // nothing to draw says nothing
+    if (now - lately.since < WINDOW) return;
+    this.rate = (1000 * lately.pictures) / (now - lately.since);
+    Object.assign(lately, { since: now, pictures: 0 });
+    if (!this.whole || document.hidden || this.rate > FEW || lately.size === PIXELS.length - 1) return;
+    lately.size++;
+    this.resize();
   }
 
   // When the graphics card had finished the first picture with Gaussians.
@@ -112,8 +142,9 @@ export class View {
   async takeRest() {
     while (this.first === null && !document.hidden) await new Promise((resolve) => setTimeout(resolve, 4));
     this.drawing.follow();
+    const { head } = this;
     try {
-      for (let index = this.head.start; index < this.head.parts.length; index++) {
+      for (let index = head.start; index < head.parts.length; index++) {
         await this.take(index);
         await new Promise((resolve) => setTimeout(resolve));
       }
@@ -123,10 +154,9 @@ export class View {
     }
   }
 
-  // Resolves once all Gaussians have come and are sorted, and nothing is left to draw.
+  // Resolves once nothing is left to draw and all is sorted.
   async settled() {
-    await this.complete;
-    const rest = () => this.left === 0 && this.drawing.sorted;
+    const rest = () => this.whole && this.left === 0 && this.drawing.sorted;
     for (let calm = 0; calm < 3; calm = rest() ? calm + 1 : 0)
       await new Promise((resolve) => requestAnimationFrame(resolve));
   }

@@ -39,6 +39,7 @@ PART = 1 << 16
 GROUP = 32
 """Frames of a part."""
 MAGIC, VERSION = b"SWAY", 1
+ELEMENT = "gaussian-swaying.js"
 
 
 def write_film(run: Path, target: Path) -> Film:
@@ -64,11 +65,11 @@ def write_film(run: Path, target: Path) -> Film:
     return film
 
 
-def bundled(film: Film) -> bytes:
-    """The content of a .sway file: a heading, then the compressed blocks, each after its size."""
+def bundled(film: Film, level: int = 9) -> bytes:
+    """The content of a .sway file: a heading, then the blocks, compressed at a level of zlib, each after its size."""
     found = [MAGIC, VERSION.to_bytes(4, "little")]
     for block in pack(film).values():
-        packed = zlib.compress(block, 9)
+        packed = zlib.compress(block, level)
         found += [len(packed).to_bytes(4, "little"), packed]
     return b"".join(found)
 
@@ -97,14 +98,50 @@ def read_bundle(path: str | os.PathLike[str]) -> Film:
 
 def page(film: Film) -> str:
     """The whole page of a film."""
-    return filled(PAGE / "film.html", film.head, {"code": (PAGE / "film.min.js").read_bytes(), **pack(film)})
+    return filled("film", film.head, {"code": (PAGE / "film.min.js").read_bytes(), **pack(film)})
 
 
-def filled(template: Path, head: dict[str, Any], blocks: dict[str, bytes]) -> str:
-    """A page of one file.
+def write_player(folder: Path) -> list[Path]:
+    """Write to a folder what plays .sway files elsewhere, and return the files.
+
+    These are ``sway.js`` for scenes of three.js and Spark, and ``gaussian-swaying.js`` with the element
+    ``<gaussian-swaying src=...>``, which also shows pages that simulate, and needs ``player.html`` and ``player.js``.
+    """
+    check_folder(folder / ELEMENT)
+    files = {
+        "sway.js": (PAGE / "sway.min.js").read_text(encoding="utf-8"),
+        ELEMENT: (PAGE / ELEMENT).read_text(encoding="utf-8"),
+        "player.html": filled("file", {"title": "A film", "background": [1.0, 1.0, 1.0]}, {}),
+        "player.js": (PAGE / "film.min.js").read_text(encoding="utf-8"),
+    }
+    for name, text in files.items():
+        write_text(folder / name, text)
+    return [folder / name for name in files]
+
+
+EMBEDDED = "<script>\n{loader}\nloadPage({options});\n</script>"
+SERVED = '<script src="player.js"></script>\n<script>{start}</script>'
+STARTS = {
+    "film": EMBEDDED.replace("{options}", "{ what: 'film', early: ['part-0', 'part-1', 'part-2'], play: 'playFilm' }"),
+    "page": EMBEDDED.replace(
+        "{options}", "{ what: 'page', early: ['worker', 'solver', 'part-0'], play: 'swayInWind' }"
+    ),
+    "live": SERVED.replace("{start}", "watchWind();"),
+    "file": SERVED.replace("{start}", "playFile(new URLSearchParams(location.search).get('src'));"),
+}
+"""How each kind of page starts: a film and a page that simulates have all inside, the live page and one that plays a
+.sway file beside it get program and data from a server."""
+HINTS = {
+    "page": "Turn the arrow for the wind, drag the object to pull it, and the rest to look around.",
+    "live": "Connecting …",
+}
+
+
+def filled(kind: str, head: dict[str, Any], blocks: dict[str, bytes]) -> str:
+    """A page.
 
     Args:
-        template: The page, with places for what differs.
+        kind: One of :data:`STARTS`.
         head: The head of a film, of which title and background are put in.
         blocks: What the page unpacks, by name, in the order in which it is needed.
     """
@@ -116,12 +153,14 @@ def filled(template: Path, head: dict[str, Any], blocks: dict[str, bytes]) -> st
     red, green, blue = (round(255 * value) for value in head["background"])
     words = {
         "title": html.escape(head["title"]),
+        "hint": HINTS.get(kind, "Drag to look around, pinch or scroll to come closer."),
         "background": f"rgb({red}, {green}, {blue})",
+        "self": "'self'" if kind in ("live", "file") else "",
         "licences": (PAGE / "LICENSES.txt").read_text(encoding="utf-8"),
-        "loader": (PAGE / "loader.js").read_text(encoding="utf-8"),
+        "start": STARTS[kind].replace("{loader}", (PAGE / "loader.js").read_text(encoding="utf-8")),
         "parts": "\n".join(parts),
     }
-    text = template.read_text(encoding="utf-8")
+    text = (PAGE / "player.html").read_text(encoding="utf-8")
     return re.sub(r"{{(\w+)}}", lambda slot: words[slot[1]], text)  # once: what is put in may have braces of its own
 
 
@@ -183,8 +222,10 @@ def pack(film: Film) -> dict[str, bytes]:
     Bytes of the same weight stand together, and frames are differences to the frame before, modulo 65536; both lose
     nothing, and the blocks compress to less.
     """
-    near, far = zip(*(in_steps(frame, film.head["step"]) for frame in film.displacement), strict=True)
-    frames: np.ndarray = np.diff(np.stack(near).view(np.uint16), axis=0, prepend=np.uint16(0))
+    steps = [in_steps(frame, film.head["step"]) for frame in film.displacement]
+    far = [rows for _, rows in steps]
+    near = np.array([frame for frame, _ in steps], np.int16).reshape(film.displacement.shape)
+    frames: np.ndarray = np.diff(near.view(np.uint16), axis=0, prepend=np.uint16(0))
     frames = frames << 1 ^ -(frames >> 15)  # the sign in the last bit, so that small numbers have a first byte of zero
     counts = np.array([len(rows) for rows in far], np.uint32)
     parts = parts_of(film.head)
@@ -259,7 +300,13 @@ def unpack(blocks: dict[str, bytes]) -> Film:
         ordered = [piece for kind in KINDS for piece, owner in zip(pieces, owners, strict=True) if owner == kind]
         fields[name] = np.concatenate(ordered)
     stencils = _unplaned(blocks["stencils"], np.dtype("<u4")).reshape(-1, 27)
-    return Film(head, **fields, order=np.arange(head["count"]), stencils=stencils, displacement=np.stack(moved))
+    return Film(
+        head,
+        **fields,
+        order=np.arange(head["count"]),
+        stencils=stencils,
+        displacement=np.array(moved, np.float32).reshape(-1, head["nodes"], 3),
+    )
 
 
 def _planes(values: np.ndarray) -> bytes:

@@ -155,14 +155,13 @@ def film_of(simulation: Simulation, grid: GridSpec, nodes: Tensor, displacement:
         "stencils": len(stencils),
         "frames": len(displacement),
         "frame_dt": simulation.frame_dt,
-        "metre": 1 / size,
         "step": size / STEPS,
         "error": 0.5 * size / STEPS,
         "cell": grid.dx / size,
         "corner": [first * grid.dx / size for first in grid.offset],
         "max_stretch": scene.max_stretch,
         **look_of(painter),
-        "camera": _camera(camera, scene, size),
+        **first_view(simulation),
         "title": f"{name[:1].upper()}{name[1:]} in the wind",
     }
     doubled = order.to(position.device)  # where numbers in double precision live
@@ -297,16 +296,14 @@ def _steps(values: Tensor) -> np.ndarray:
     return found
 
 
-def _camera(camera: Camera, scene: SimulatedScene, size: float) -> dict[str, Any]:
-    """The first camera of a run: eye, the point on its axis closest to the object, field of view [degrees]."""
+def first_view(simulation: Simulation) -> dict[str, Any]:
+    """The first camera of a run: eye, point on its axis nearest to the object, field of view [degrees]; and a metre."""
+    scene, camera = simulation.scene, simulation.painter.camera_at(0)
+    size = scene.size * scene.frame.metres_per_unit
     eye = scene.frame.point_to_sim(in_double(camera.position)) / size
     axis = scene.frame.direction_to_sim(in_double(camera.world_to_camera[2, :3]))
     target = eye + axis * float((-eye * axis).sum().clamp_min(0.2))
     field = 2 * torch.atan(camera.height / (2 * in_double(camera.intrinsics[1, 1])))
     across = camera.width * camera.intrinsics[1, 1] / (camera.height * camera.intrinsics[0, 0])
-    return {
-        "eye": eye.tolist(),
-        "target": target.tolist(),
-        "fov": float(field.rad2deg()),
-        "aspect": float(across),
-    }
+    looks = {"eye": eye.tolist(), "target": target.tolist(), "fov": float(field.rad2deg()), "aspect": float(across)}
+    return {"camera": looks, "metre": 1 / size}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import torch
@@ -9,15 +10,13 @@ import torch
 from gaussian_swaying._files import check_page, write_text
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.film.page import PAGE as FILM_PAGE
-from gaussian_swaying.viewer.film.page import filled, pack_head, pack_splats, parts_of
+from gaussian_swaying.viewer.film.page import filled, pack
 from gaussian_swaying.viewer.film.recorded import Film, film_without_frames
 from gaussian_swaying.viewer.live_web.block import check, pack_solver
+from gaussian_swaying.viewer.panel import group
 from gaussian_swaying.wind.field import WindField
 
 PAGE = Path(__file__).parent / "page"
-
-ELEMENT = "gaussian-swaying.js"
-"""The script with which another page shows this one in a ``<gaussian-swaying>``."""
 
 
 def write_live_web(simulation: Simulation, name: str, target: Path) -> Film:
@@ -40,16 +39,20 @@ def write_live_web(simulation: Simulation, name: str, target: Path) -> Film:
     with torch.inference_mode():
         film = film_without_frames(simulation, state, name)
         solver = pack_solver(simulation, nodes)
-    film.head["wind"] = wind.mean_flow(torch.zeros((), dtype=torch.float64)).tolist()
-    parts = parts_of(film.head)
-    blocks = {"code": (FILM_PAGE / "film.min.js").read_bytes(), **pack_head(film, parts)}
-    blocks |= {"worker": (PAGE / "worker.min.js").read_bytes(), "solver": solver}
-    for index, (kind, first, last) in enumerate(parts):
-        blocks[f"part-{index}"] = pack_splats(film, kind == "moving", first, last)
-    write_text(target, filled(PAGE / "live_web.html", film.head, blocks))
+    flow = wind.mean_flow(torch.zeros((), dtype=torch.float64)).tolist()
+    rim = max(10.0, 2 * math.hypot(flow[0], flow[1]))
+    factor = {"kind": "range", "unit": "×"}
+    film.head["panel"] = [
+        group("Wind", [
+            {"kind": "dial", "name": "wind", "label": "Wind", "value": flow, "high": rim},
+            factor | {"name": "gusts", "label": "gusts", "low": 0.0, "high": 3.0, "log": False, "value": 1.0},
+        ]),
+        group("Material", [
+            factor | {"name": "stiffness", "label": "stiffness", "low": 0.125, "high": 4.0, "log": True, "value": 1.0}
+        ]),
+    ]  # fmt: skip
+    code = {name: (folder / f"{name}.min.js").read_bytes() for name, folder in (("film", FILM_PAGE), ("worker", PAGE))}
+    packed = pack(film)
+    blocks = {"code": code["film"], "head": packed.pop("head"), "stencils": packed.pop("stencils")}
+    write_text(target, filled("page", film.head, blocks | {"worker": code["worker"], "solver": solver} | packed))
     return film
-
-
-def write_element(folder: Path) -> None:
-    """Write :data:`ELEMENT` to a folder."""
-    write_text(folder / ELEMENT, (PAGE / ELEMENT).read_text(encoding="utf-8"))

@@ -154,6 +154,36 @@ def test_a_scene_of_ones_own_plays_a_bundle(own_scene, tmp_path):
     assert wrong == "none.sway cannot be read (404)"
 
 
+def test_an_element_plays_a_bundle(browser, run, tmp_path):
+    """In a page of a user's, beside what `--player` wrote; a file that is not there is said."""
+    write_film(run, tmp_path / "flag.sway")
+    assert main(["--player", str(tmp_path)]) == 0
+    page = listened(browser.new_page(viewport={"width": 320, "height": 180}))
+
+    def serve(route):
+        path = tmp_path / route.request.url.removeprefix("http://own.test/").partition("?")[0]
+        kinds = {".html": "text/html", ".js": "text/javascript", ".sway": "application/vnd.gaussian-swaying"}
+        if path.is_file():
+            route.fulfill(body=path.read_bytes(), content_type=kinds[path.suffix])
+        else:
+            route.fulfill(status=404)
+
+    for name, film in (("whole", "flag.sway"), ("none", "none.sway")):
+        element = f'<gaussian-swaying src="{film}"></gaussian-swaying>'
+        (tmp_path / f"{name}.html").write_text(f'<!doctype html><script src="gaussian-swaying.js"></script>{element}')
+    page.route("http://own.test/**", serve)
+    page.goto("http://own.test/whole.html")
+    until(lambda: len(page.frames) == 2 and page.frames[1].evaluate("!!window.film"))
+    assert page.frames[1].evaluate("film.seek(5).then(() => film.frame())") == 5
+    found = double(page.frames[1].evaluate("film.positions().then((found) => Array.from(found))")).reshape(-1, 3)
+    assert longest(found - read_bundle(tmp_path / "flag.sway").moved(5)[0]) < 1e-3  # whose stretch has no limit
+    assert page.problems == []
+    page.goto("http://own.test/none.html")
+    message = page.frame_locator("iframe").locator("#message")
+    message.filter(has_text="none.sway cannot be read (404)").wait_for()
+    page.close()
+
+
 def test_gaussians_are_sorted_from_far_to_near(show, film):
     """Equal depths keep their order; what is infinitely far or has a negative depth is not drawn."""
     page = show(film)

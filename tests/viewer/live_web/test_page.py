@@ -1,12 +1,14 @@
 """The page without a server in a real browser: what it shows, what the visitor does, and damaged files."""
 
+import math
 import re
 import time
 
 import pytest
 from browsers import asked_of_a_network, until
 
-from gaussian_swaying.viewer.live_web.page import write_element, write_live_web
+from gaussian_swaying.viewer.film.page import write_player
+from gaussian_swaying.viewer.live_web.page import write_live_web
 
 from .conftest import drawn_apart, opened
 
@@ -67,11 +69,8 @@ def _stops(page):
 def test_what_the_visitor_does(show, written):
     """The clock, pause, wind, link, a pull and a turn of the view."""
     page = show(written, "#wind=0,0,0&gusts=0&stiffness=2&speed=0.25")
-    assert page.evaluate("[windPage.settings.wind, windPage.settings.gusts, windPage.settings.stiffness]") == [
-        [0, 0, 0],
-        0,
-        2,
-    ]
+    until(lambda: page.evaluate("windPage.value('stiffness')") == 2)
+    assert page.evaluate("['wind', 'gusts'].map(windPage.value)") == [[0, 0, 0], 0]
     assert page.locator("#slow").get_attribute("aria-pressed") == "true"
     link = page.evaluate("windPage.link()")
     until(lambda: _grabbed(page))
@@ -94,10 +93,10 @@ def test_what_the_visitor_does(show, written):
     until(lambda: page.evaluate("windPage.time() ?? 0") > stopped)
     box = page.locator("#dial").bounding_box()
     page.mouse.click(box["x"] + 0.9 * box["width"], box["y"] + 0.5 * box["height"])
-    assert page.evaluate("Math.hypot(...windPage.settings.wind)") == pytest.approx(10 * 0.8 / 0.96, rel=0.05)
-    for name, ends in {"gusts": ("0", "3"), "stiffness": ("-3", "2")}.items():  # those of the link
-        slider = page.locator(f"#{name}")
-        assert (slider.get_attribute("min"), slider.get_attribute("max")) == ends
+    assert page.evaluate("Math.hypot(...windPage.value('wind'))") == pytest.approx(10 * 0.8 / 0.96, rel=0.05)
+    for name, ends in {"gusts": (0, 3), "stiffness": (math.log10(0.125), math.log10(4))}.items():
+        slider = page.locator(f"input[type=range][name={name}]")
+        assert [float(slider.get_attribute(end)) for end in ("min", "max")] == pytest.approx(ends)
     link = page.evaluate("windPage.link()")
     assert re.search(r"#wind=[-\d.,]+&gusts=0&stiffness=2&view=[-\d.,]+$", link)
 
@@ -110,8 +109,10 @@ def test_what_the_visitor_does(show, written):
 
     until(turned)
     other = show(written, link[link.index("#") :])
-    for part in ("windPage.settings.wind", "windPage.settings.gusts"):
-        assert other.evaluate(part) == pytest.approx(page.evaluate(part), abs=1e-3)
+    other.evaluate("windPage.complete")
+    for part in ("wind", "gusts"):
+        known = [each.evaluate(f"windPage.value('{part}')") for each in (page, other)]
+        assert known[0] == pytest.approx(known[1], abs=1e-3)
     page.locator("#play").click()  # or its first moments pass between two looks
     page.locator("#reset").click()
     until(lambda: page.evaluate("windPage.time() ?? 1") < 0.3)
@@ -152,7 +153,7 @@ def test_a_browser_without_vectors_in_webassembly_says_so(show, written):
 
 def test_a_page_within_another_page(browser, written):
     """``<gaussian-swaying>`` passes its attributes on, also when they change."""
-    write_element(written.parent)
+    write_player(written.parent)
     outer = written.parent / "outer.html"
     element = f'<gaussian-swaying src="{written.name}" wind="1,2,0" view="0,-3,0,0,0,0"></gaussian-swaying>'
     outer.write_text(f'<!doctype html><script src="gaussian-swaying.js"></script>{element}')
@@ -160,8 +161,8 @@ def test_a_page_within_another_page(browser, written):
     page.goto(outer.as_uri())
     until(lambda: len(page.frames) == 2 and page.frames[1].evaluate("!!window.windPage"))
     inner = page.frames[1]
-    assert inner.evaluate("windPage.settings.wind") == [1, 2, 0]
+    until(lambda: inner.evaluate("windPage.value('wind')") == [1, 2, 0])
     assert re.search(r"&?view=0,-3,0,0,0,0$", inner.evaluate("windPage.link()"))
     page.evaluate("document.querySelector('gaussian-swaying').setAttribute('wind', '-3,0,0')")
-    until(lambda: inner.evaluate("windPage.settings.wind[0]") == -3)
+    until(lambda: inner.evaluate("windPage.value('wind')[0]") == -3)
     page.close()

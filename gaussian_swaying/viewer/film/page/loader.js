@@ -1,6 +1,6 @@
 "use strict";
 // Unpacks the parts of a page, which follow below, while it is read. `what` is what the page shows, `early` are the parts that the
-// first picture needs besides the program, its head and stencils; they are unpacked at once. `play` starts the program.
+// first picture needs besides the program, its head and stencils; they are unpacked at once. `play` names the function that starts.
 async function loadPage({ what, early, play }) {
   const message = document.getElementById("message");
   const say = (text) => { message.textContent = text; message.hidden = false; };
@@ -38,7 +38,7 @@ async function loadPage({ what, early, play }) {
     const code = document.createElement("script");
     code.textContent = new TextDecoder().decode(await read("code"));
     document.head.append(code);
-    await play(read, tell);
+    await window[play](read, tell);
     message.hidden = true;
   } catch (error) {
     console.error(error);

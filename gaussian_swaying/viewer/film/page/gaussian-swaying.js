@@ -1,7 +1,9 @@
-// <gaussian-swaying src="flag.html" wind="4,0,0" view="0,-2,0,0,0,0"></gaussian-swaying>: a page of export --live-web within another page.
+// <gaussian-swaying src="flag.html" wind="4,0,0" view="0,-2,0,0,0,0"></gaussian-swaying>: a page of export --live-web, or a .sway file,
+// within another page.
 // Attributes, besides src: wind (x, y and z, m/s), gusts, stiffness and speed (1 as in the page), view (place of the camera, and what it
 // looks at), and solver (webgpu or worker), as in the link that the page's button copies.
 (() => {
+  const beside = document.currentScript.src.replace(/[^/]*$/, ""); // where player.html lies
   const SETTINGS = ["wind", "gusts", "stiffness", "speed", "view", "solver"];
 
   class GaussianSwaying extends HTMLElement {
@@ -25,7 +27,9 @@
     }
 
     open() {
-      this.frame.src = `${this.getAttribute("src")}#${this.settings}`;
+      const src = this.getAttribute("src");
+      const film = `${beside}player.html?src=${encodeURIComponent(new URL(src, document.baseURI).href)}`;
+      this.frame.src = `${/\.sway($|\?)/.test(src) ? film : src}#${this.settings}`;
     }
 
     attributeChangedCallback(name) {
