@@ -241,12 +241,8 @@ def joined(arguments: Sequence[str]) -> list[str]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Preview, print the report and write the files.
 
-    Args:
-        arguments: Command line; that of the process if None.
-
     Returns:
-        0 if all went well, 2 on bad input, 130 if stopped with Ctrl-C. With the environment variable
-        ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
+        The exit code, as from :func:`~gaussian_swaying.cli.errors.run_command`.
     """
     arguments = joined(sys.argv[1:] if arguments is None else arguments)
     parser = build_options()
