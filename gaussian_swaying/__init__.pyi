@@ -12,6 +12,7 @@ from .geometry.regions import Box as Box
 from .geometry.regions import Cylinder as Cylinder
 from .geometry.regions import Sphere as Sphere
 from .inverse.fit import fit as fit
+from .inverse.from_film import fit_film as fit_film
 from .mpm.boundary import Boundary as Boundary
 from .mpm.contact import Contact as Contact
 from .mpm.forces import Force as Force

@@ -59,13 +59,16 @@ def _loader() -> Callable[[str], Any]:
     return get_loader("yaml")
 
 
-def read_fields(path: str | os.PathLike[str], what: str, fields: Sequence[str]) -> dict[str, Any]:
+def read_fields(
+    path: str | os.PathLike[str], what: str, fields: Sequence[str], change: Callable[[Any], Any] = lambda given: given
+) -> dict[str, Any]:
     """Read a YAML file with known fields at the top; any of them may be missing.
 
     Args:
         path: The file.
         what: Name of the kind of file, for the message, for example "the sweep file".
         fields: Names that it may have.
+        change: Returns what was read, or refuses it.
 
     Returns:
         The given values, by name.
@@ -74,7 +77,7 @@ def read_fields(path: str | os.PathLike[str], what: str, fields: Sequence[str]) 
 
     file = check_regular(path, what, LARGEST)
     try:
-        given = yaml.safe_load(check_yaml(file.read_text(encoding="utf-8")))
+        given = change(yaml.safe_load(check_yaml(file.read_text(encoding="utf-8"))))
     except UnicodeDecodeError as error:
         raise ValueError(f"{file} is not UTF-8 text ({error.reason}): save it as UTF-8.") from error
     except yaml.YAMLError as error:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import torch
@@ -17,14 +16,11 @@ from torch import Tensor
 
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
-from gaussian_swaying.scenes.printed_cloth import PERIOD, printed_colours
 from gaussian_swaying.scenes.procedural import FlagScene, both
 from gaussian_swaying.simulation.simulation import Simulation
 
 WALLS = ((2.4, 1.6, 0.0, (-0.9, 0.6, -0.7)), (0.5, 1.6, 65.0, (0.75, 0.1, -0.7)))
 """Width, height [m], turn from the x axis [degrees] and lower corner [m] of the walls behind and beside the flag."""
-TEXELS = 400
-"""Places along a period of the print at which it is photographed."""
 
 
 def write_base(folder: Path, wall: float = 0.02) -> Path:
@@ -55,48 +51,11 @@ def drift(frames: int) -> Tensor:
     return 1 + way * torch.tensor([-0.15, -0.25, -0.35], dtype=torch.float64) + ripple
 
 
-@cache
-def _texture() -> Tensor:
-    step = (torch.arange(TEXELS) + 0.5) * (PERIOD / TEXELS)
-    return printed_colours(*torch.meshgrid(step, step, indexing="ij"))
-
-
-def _roughly(x: Tensor, z: Tensor) -> Tensor:
-    """Colours of the print to a texel, shape (N, 3), which take less time than exact ones."""
-    texel = (torch.stack([x, z]) * (TEXELS / PERIOD)).long() % TEXELS
-    return _texture()[texel[0], texel[1]]
-
-
-def photographed(
-    camera: Camera,
-    sheets: Sequence[tuple[float, float, float, tuple[float, ...]]] = WALLS,
-    finer: int = 2,
-    colours: Callable[[Tensor, Tensor], Tensor] = _roughly,
-) -> Tensor:
-    """Printed sheets themselves, by rays and not as Gaussians, black elsewhere, float64, shape (H, W, 3)."""
-    rows, columns = ((torch.arange(n * finer) + 0.5).double() / finer for n in (camera.height, camera.width))
-    row, column = torch.meshgrid(rows, columns, indexing="ij")
-    local = torch.stack([column, row, torch.ones_like(row)], -1) @ camera.intrinsics.double().inverse().T
-    ray, eye = local @ camera.world_to_camera[:3, :3].double(), camera.position.double()
-    near, colour = torch.full_like(row, math.inf), torch.zeros_like(ray)
-    for width, height, yaw, corner in sheets:
-        turn, origin = math.radians(yaw), eye.new_tensor(corner)
-        along = eye.new_tensor([math.cos(turn), math.sin(turn), 0])
-        normal = eye.new_tensor([-math.sin(turn), math.cos(turn), 0])
-        far = (origin - eye) @ normal / (ray @ normal)
-        place = eye + far[..., None] * ray - origin
-        x, z = place @ along, place[..., 2]
-        seen = (far > 0) & (far < near) & (x > 0) & (x < width) & (z > 0) & (z < height)
-        near[seen], colour[seen] = far[seen], colours(x[seen], z[seen]).double()
-    return colour.unflatten(0, (-1, finer)).unflatten(2, (-1, finer)).mean((1, 3))
-
-
 def write_film(
     simulation: Simulation,
     folder: Path,
     cameras: Sequence[Camera],
     gains: Tensor | None = None,
-    real: bool = False,
 ) -> None:
     """Simulate, and write what a moving camera sees as ``film.mp4`` with the camera of its first frame alone."""
     from imageio_ffmpeg import write_frames
@@ -113,15 +72,10 @@ def write_film(
         output_params=["-crf", "23"],
     )
     film.send(None)
-    moving = simulation.scene.moving if real else torch.arange(len(simulation.scene.model.means))
     for frame in simulation.frames(len(cameras)):
         gaussians = painter.deformed(frame.state)
         own = cameras[frame.index].to(painter.device, torch.float32)
-        parts = gaussians.means, gaussians.covariances, painter.opacity(), painter.colors(gaussians, own)
-        drawn = painter.renderer(*(part[moving] for part in parts), own)
-        colour = drawn.color.cpu().double()
-        if real:
-            colour += (1 - drawn.alpha.cpu().double()) * photographed(cameras[frame.index])
+        colour = painter.picture(gaussians, own).color.cpu().double()
         colour = colour * (1 if gains is None else gains[frame.index])
         colour = 255 * colour + 2.0 * torch.randn(colour.shape, generator=generator)
         film.send(colour.round().clamp(0, 255).to(torch.uint8).numpy().tobytes())

@@ -46,8 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Parse and compare.
 
     Returns:
-        0 if all went well, 2 on bad input, 130 if stopped with Ctrl-C. With ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep
-        their traceback.
+        The exit code, as from :func:`~gaussian_swaying.cli.errors.run_command`.
     """
     parser = build_parser()
     return run_command(

@@ -18,7 +18,6 @@ from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.config.material_names import NAMES
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.measures import DIRECTIONS
-from gaussian_swaying.gaussians.parts import Parts
 from gaussian_swaying.gaussians.repair import OPAQUE_LOGIT
 from gaussian_swaying.geometry.origin import counted_from
 from gaussian_swaying.simulation.measure import duration
@@ -26,13 +25,13 @@ from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.suggestion.cost import Cost, Stopwatch, estimate_cost
 from gaussian_swaying.suggestion.kinds import KINDS
 from gaussian_swaying.suggestion.picture import preview_picture
+from gaussian_swaying.suggestion.starter import write_starter
 from gaussian_swaying.suggestion.suggest import QUALITIES, suggest
 from gaussian_swaying.suggestion.suggestion import (
     FRAME_DT,
     PICTURE,
     Suggestion,
     as_plain,
-    configuration,
     cost_lines,
     run_lines,
     things_lines,
@@ -169,25 +168,6 @@ def _write_numbers(folder: Path, cost: Cost, **more: Any) -> None:
     (folder / "preview.json").write_text(text + "\n", encoding="utf-8")
 
 
-def write_starter(found: Suggestion, folder: Path, frames: int) -> list[str]:
-    """Write the configuration and its parts; others that are there are kept aside, as they may have been edited."""
-    folder.mkdir(parents=True, exist_ok=True)
-    parts = (folder / "parts.npz").resolve()
-    assert found.path is not None
-    keep_aside(folder / "starter.yaml", configuration(found, found.path, parts, frames))
-    if found.parts is not None and parts.exists() and not _same(parts, found.parts.parts):
-        _rename(parts)
-    found.to_yaml(folder / "starter.yaml", frames)
-    return [*(["parts.npz"] if found.parts is not None else []), "starter.yaml"]
-
-
-def _same(file: Path, parts: Parts) -> bool:
-    try:
-        return Parts.load(file).digest() == parts.digest()
-    except ValueError:
-        return False
-
-
 def doubts(found: Suggestion, options: argparse.Namespace) -> list[str]:
     """Warnings about weak guesses, each with the command for the guess and the one for the next best."""
     lines: list[str] = []
@@ -230,19 +210,6 @@ def splat_name(path: str | Path) -> str:
     return next((name for name in folders if name and not name.startswith(passed)), file.stem)
 
 
-def keep_aside(path: Path, text: str) -> None:
-    """Rename a file that has another text, as it may have been edited: ``fit.yaml`` to ``fit.1.yaml``, and so on."""
-    if path.exists() and path.read_text(encoding="utf-8") != text:
-        _rename(path)
-
-
-def _rename(path: Path) -> None:
-    number = 1
-    while (other := path.with_suffix(f".{number}{path.suffix}")).exists():
-        number += 1
-    path.rename(other)
-
-
 def _numbers(move: str) -> list[int]:
     try:
         return list(dict.fromkeys(int(number) for number in move.split(",")))
@@ -274,12 +241,8 @@ def joined(arguments: Sequence[str]) -> list[str]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Preview, print the report and write the files.
 
-    Args:
-        arguments: Command line; that of the process if None.
-
     Returns:
-        0 if all went well, 2 on bad input, 130 if stopped with Ctrl-C. With the environment variable
-        ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
+        The exit code, as from :func:`~gaussian_swaying.cli.errors.run_command`.
     """
     arguments = joined(sys.argv[1:] if arguments is None else arguments)
     parser = build_options()

@@ -23,12 +23,8 @@ if TYPE_CHECKING:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse, build, run.
 
-    Args:
-        arguments: Command line; that of the process if None.
-
     Returns:
-        0 if all went well, 2 on bad input or a simulation that diverged, 130 if stopped with Ctrl-C, 143 by SIGTERM,
-        129 by SIGHUP. With the environment variable ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
+        The exit code, as from :func:`~gaussian_swaying.cli.errors.run_command`.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     parser = Simulation.parser()

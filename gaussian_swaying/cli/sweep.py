@@ -70,8 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Parse and sweep.
 
     Returns:
-        0 if all runs are complete, 2 on bad input or if a run failed, 130 if stopped with Ctrl-C, 143 by SIGTERM. With
-        ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
+        The exit code, as from :func:`~gaussian_swaying.cli.errors.run_command`.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     parser = build_parser()

@@ -63,8 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Parse and run.
 
     Returns:
-        0 if all went well, 2 on bad input or if training diverged, 130 if stopped with Ctrl-C, 143 by SIGTERM, 129 by
-        SIGHUP. With the environment variable ``GAUSSIAN_SWAYING_DEBUG=1`` errors keep their traceback.
+        The exit code, as from :func:`~gaussian_swaying.cli.errors.run_command`.
     """
     run_folder, given = RunFolder(), sys.argv[1:] if arguments is None else list(arguments)
 

@@ -39,6 +39,7 @@ GONE = {
     "CylinderObstacle": "Obstacle with a null among its `radii`",
     "EllipsoidObstacle": "Obstacle",
     "BallObstacle": "Obstacle with `shape: Sphere`",
+    "fit.wind_changes": "`until`, for a part of the film in which the wind is steady",
     "FlagOnStandScene": "FlagScene with `stand: pole`",
 }
 """What to use in place of classes, fields of classes (``Class.field``) and other fields (``scene.field``)."""

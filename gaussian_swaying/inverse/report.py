@@ -18,19 +18,9 @@ from torch import Tensor
 from gaussian_swaying._files import write_json, write_table, write_text
 from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.gaussians.model import DeformedGaussians
-from gaussian_swaying.inverse.evidence import BAND, Judged, titled
-from gaussian_swaying.inverse.unknowns import (
-    SCALE,
-    Direction,
-    Gusts,
-    Unknown,
-    changing,
-    gusts_of,
-    is_change,
-    model_of,
-    of_simulation,
-    values_at,
-)
+from gaussian_swaying.inverse.hand import Judged
+from gaussian_swaying.inverse.pictures import BEFORE, titled
+from gaussian_swaying.inverse.unknowns import SCALE, Direction, Unknown, model_of, of_simulation, values_at
 from gaussian_swaying.inverse.videos import Footage
 from gaussian_swaying.recording.video import VideoEncoder
 from gaussian_swaying.simulation.model import POLAR, flow_of, in_settings
@@ -39,8 +29,7 @@ from gaussian_swaying.simulation.simulation import Simulation
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
-BEFORE, PICTURES = "before", "pictures"
-"""Folder of the pictures that are written before a fit starts."""
+PICTURES = "pictures"
 
 SHOWN = 3
 """Frames of the fitted and of the predicted part in a picture."""
@@ -54,6 +43,8 @@ FOLLOWED, LOST = 0.95, 0.5
 VAGUE, TURNED = 0.25, 5.0
 """Standard error, as a share of the range (of the value on a logarithmic scale), and of an angle [degrees], above which
 an unknown is called not determined."""
+
+CHECK = "Raise `search`, widen the ranges, check the base and `known`"
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +69,7 @@ class Shown:
 
 
 @dataclass(frozen=True, eq=False)
-class Result:
+class Fit:
     """The result of a fit.
 
     Attributes:
@@ -87,7 +78,7 @@ class Result:
         covariance: Covariance of the places, shape (U, U).
         directions: Principal directions of the sensitivities, the best known first.
         shown: Comparison with the video of each camera.
-        history: One row for each iteration.
+        history: One row for each step.
         seconds: Time it took.
         unsettled: The reason why the values are not a local minimum, and a remedy; empty if they are one.
         notes: What the videos say against the plan.
@@ -126,17 +117,12 @@ class Result:
         return {u.name: s * u.slope(p) for u, s, p in zip(self.unknowns, share, self.place, strict=True)}
 
     @property
-    def gusts(self) -> Gusts | None:
-        """Mean, intensity and time scale of a wind that changes; None of a steady one."""
-        return gusts_of(self.unknowns, self.place, self.covariance)
-
-    @property
     def vague(self) -> list[str]:
+        """Names of the unknowns that are not determined."""
         values, errors, found = self.values, self.errors, []
         for u in self.unknowns:
             most = VAGUE * (abs(values[u.name]) if u.scale == "log" else u.high - u.low)
-            most = min(most, TURNED) if u.unit == "degrees" else most
-            if errors[u.name] > most:
+            if errors[u.name] > (min(most, TURNED) if u.unit == "degrees" else most):
                 found.append(u.name)
         return found
 
@@ -159,22 +145,18 @@ class Result:
                 f"Another start fits as well or better ({told}). Begin there (`start`), or film from one more side."
             )
         for name, share in self.followed.items():
-            told = (
-                f"camera {name}: the simulation explains {max(share, 0):.0%} of the motion of its tracks. Raise "
-                "`search`, widen the ranges, check the base and `known`, or film from a side where the motion is "
-                "across the picture."
-            )
             if share < FOLLOWED:
-                (failed if share < LOST else doubtful).append(told)
+                (failed if share < LOST else doubtful).append(
+                    f"camera {name}: the simulation explains {max(share, 0):.0%} of the motion of its tracks. {CHECK}, "
+                    "or film from a side where the motion is across the picture."
+                )
         for one in self.shown:
             if one.camera in self.astray and self.followed.get(one.camera, 0.0) < FOLLOWED:
                 failed.append(
                     f"camera {one.camera} is not followed: its fitted frames are {one.rest - one.fitted:.0f} dB worse "
-                    "than the one at rest, so the values may be wrong. Fit a shorter part (`until`), raise `search`, "
-                    "or check the base and `known`."
+                    f"than the one at rest, so the values may be wrong. {CHECK}, or fit a shorter part (`until`)."
                 )
-        if self.unsettled:
-            doubtful.append(self.unsettled)
+        doubtful += [self.unsettled] if self.unsettled else []
         doubtful += [
             f"{name} is not determined by this video: its error is large. Film longer or from one more side, or lower "
             "`solver.dx`."
@@ -191,35 +173,25 @@ class Result:
 
     def rows(self) -> list[dict[str, Any]]:
         """The table: a row for each unknown."""
-        values, errors = self.values, self.errors
+        found = zip(self.unknowns, self.values.values(), self.errors.values(), strict=True)
         return [
-            {
-                "name": u.name,
-                "value": values[u.name],
-                "standard_error": errors[u.name],
-                "unit": u.unit,
-                "low": u.low,
-                "high": u.high,
-            }
-            for u in self.unknowns
+            {"name": u.name, "value": value, "standard_error": error, "unit": u.unit, "low": u.low, "high": u.high}
+            for u, value, error in found
         ]
 
     def text(self) -> str:
+        """All of it in words."""
         lines = [f"{'':<28}{'value':>12}{'error':>12}"]
         for row in self.rows():
             lines.append(f"{row['name']:<28}{row['value']:>12.5g}{row['standard_error']:>12.2g} {row['unit']}".rstrip())
         for one in self.shown:
             told = "" if math.isnan(one.predicted) else f", predicted frames {one.predicted:.2f} dB"
             lines.append(f"camera {one.camera}: fitted frames {one.fitted:.2f} dB{told}")
-        lines += self.seen
-        lines += [self.gusts.sentence()] if self.gusts else []
-        lines += [sentence for one in self.judged for sentence in one.sentences()]
+        lines += [*self.seen, *(sentence for one in self.judged for sentence in one.sentences())]
         failed, doubtful = self.doubts()
         said = {"good": "This fit is good.", "doubtful": "This fit is doubtful:", "failed": "This fit has failed:"}
         lines += [said[self.verdict], *failed, *doubtful]
-        if self.assumed:
-            lines += ["Not measured:", *self.assumed]
-        return "\n".join(lines)
+        return "\n".join([*lines, *(["Not measured:", *self.assumed] if self.assumed else [])])
 
 
 def predictions(
@@ -250,8 +222,7 @@ def predictions(
                 frame = video.frame_at(time)
                 if frame is None:
                     continue
-                camera = video.cameras[frame].to(painter.device)
-                drawn = painter.picture(gaussians, camera)
+                drawn = painter.picture(gaussians, video.cameras[frame].to(painter.device))
                 shown = drawn.color.clamp(0, 1).float().cpu()
                 real = video.images[frame].float() / 255
                 squares[number][k >= fitted].append(float((shown - real).square().mean()))
@@ -263,29 +234,20 @@ def predictions(
     found = []
     for video, own, row in zip(videos, squares, rows, strict=True):
         picture = (torch.cat([part for _, part in row]) * 255).round().to(torch.uint8)
-        found.append(
-            Shown(video.name, _psnr(own[0]), _psnr(own[1]), _psnr(own[0][:1]), picture, tuple(told for told, _ in row))
-        )
+        psnr = (_psnr(own[0]), _psnr(own[1]), _psnr(own[0][:1]))
+        found.append(Shown(video.name, *psnr, picture, tuple(told for told, _ in row)))
     return found
 
 
 @contextmanager
 def _films(folder: Path | None, videos: Sequence[Footage]) -> Iterator[Callable[[int, list[tuple[str, Tensor]]], None]]:
-    """Writes ``film_CAMERA.mp4``, a video beside its fit, for each camera.
-
-    Args:
-        folder: Where to write; None to write nothing.
-        videos: The videos.
-
-    Yields:
-        Adds a frame to that of a camera, by its number: titles and pictures (H, W, 3), colours in [0, 1].
-    """
+    """Writes ``film_CAMERA.mp4`` for each camera; yields the function that adds a frame to that of a number."""
     encoders = []
-    if folder is not None:
+    for video in videos if folder is not None else ():
+        assert folder is not None
         folder.mkdir(exist_ok=True)
-        for video in videos:
-            rate = (len(video.times) - 1) / (video.times[-1] - video.times[0])
-            encoders.append(VideoEncoder(folder / f"film_{video.name}.mp4", rate))
+        rate = (len(video.times) - 1) / (video.times[-1] - video.times[0])
+        encoders.append(VideoEncoder(folder / f"film_{video.name}.mp4", rate))
 
     def add(number: int, panels: list[tuple[str, Tensor]]) -> None:
         if encoders:
@@ -301,7 +263,7 @@ def _films(folder: Path | None, videos: Sequence[Footage]) -> Iterator[Callable[
 
 
 def write_results(
-    folder: Path, result: Result, parser: ArgumentParser, settings: Namespace, simulation: Simulation
+    folder: Path, result: Fit, parser: ArgumentParser, settings: Namespace, simulation: Simulation
 ) -> None:
     """Write ``values.csv``, ``result.json``, ``scene.yaml`` and the folder ``pictures``."""
     import imageio.v3 as iio
@@ -309,7 +271,9 @@ def write_results(
     pictures = folder / PICTURES
     pictures.mkdir(exist_ok=True)
     for one in result.shown:
-        iio.imwrite(pictures / f"{one.camera}.png", _labelled(one))
+        names = ("video", "simulation", "difference (grey: none)")
+        panels = (one.picture.float() / 255).split(one.picture.shape[1] // 3, 1)
+        iio.imwrite(pictures / f"{one.camera}.png", titled(list(zip(names, panels, strict=True)), one.rows))
     write_table(folder / "values.csv", result.rows())
     failed, doubtful = result.doubts()
     write_json(
@@ -330,7 +294,6 @@ def write_results(
             "verdict": result.verdict,
             "why": [*failed, *doubtful],
             "motion_explained": dict(result.followed),
-            "gusts": asdict(result.gusts) | {"time_scale_is_told": result.gusts.told} if result.gusts else None,
             "notes": list(result.notes),
             "assumed": list(result.assumed),
             "background": [asdict(one) for one in result.judged],
@@ -347,24 +310,18 @@ def write_results(
 
 def scene_text(values: Mapping[str, float], parser: ArgumentParser, settings: Namespace, simulation: Simulation) -> str:
     """The configuration of the base with the values that were found, as YAML for ``sim``."""
-    found, ratio, remark = settings.clone(), 1.0, ""
+    found, remark = settings.clone(), ""
+    if any(name in values for name in POLAR):
+        found.wind.flow = flow_of(simulation.wind.flows[0].tolist(), values)  # type: ignore[index]
+    in_settings(found, {name: value for name, value in of_simulation(values).items() if name not in POLAR})
     if SCALE in values:
         ratio = values[SCALE] / simulation.scene.frame.metres_per_unit
         remark = f"# Below, a metre is a length of {ratio:.6g} m.\n"
-    if any(name in values for name in POLAR):
-        found.wind.flow = flow_of(simulation.wind.flows[0].tolist(), values)  # type: ignore[index]
-    changes = any(map(is_change, values))
-    if changes or (SCALE in values and found.wind.schedule):
-        wind: Any = simulation.wind
-        wind = changing(wind.with_flow(found.wind.flow), values) if changes else wind
-        rows = zip(wind.times.tolist(), wind.flows.tolist(), strict=True)
-        found.wind.schedule = [{"time": time, "flow": [part / ratio for part in flow]} for time, flow in rows]
-        found.wind.interpolation = wind.interpolation
-    in_settings(found, {name: value for name, value in of_simulation(values).items() if name not in POLAR})
-    if SCALE in values:
         model = model_of(simulation.model, values)
         scaled = ("material.E", "material.density", "solver.gravity")
         in_settings(found, {name: model.value(name) for name in scaled})
+        for row in found.wind.schedule or ():
+            row["flow"] = [part / ratio for part in row["flow"]]
         found.wind.flow = found.wind.flow and [part / ratio for part in found.wind.flow]
         if found.material.bending is not None:
             found.material.bending /= ratio**5
@@ -375,27 +332,16 @@ def scene_text(values: Mapping[str, float], parser: ArgumentParser, settings: Na
 def consequences(
     assumed: Sequence[str], values: Mapping[str, float], simulation: Simulation, gravity: Sequence[float]
 ) -> list[str]:
-    """Sentences on what follows for the values from what was only assumed.
-
-    Args:
-        assumed: ``length`` or ``mass``, or both.
-        values: The values that were found.
-        simulation: The scene.
-        gravity: Of the scene [m/s²].
-    """
+    """Sentences on what follows for the values from what was only assumed, of ``length`` and ``mass``."""
     scene, found = simulation.scene, []
     longest = scene.size * scene.frame.metres_per_unit
     if "length" in assumed:
         speed = values.get("wind.speed")
         told = "" if speed is None else f" In its own lengths the speed is {speed / longest:.3g} a second."
+        told += " Gravity makes both depend on the length: measure one, and give it with --length." * any(gravity)
         found.append(
             f"No length is known: the longest side of what moves was taken as {longest:.3g} m. Metres a second and "
             f"pascals have no absolute value then, while angles do.{told}"
-            + (
-                " Gravity makes both depend on the length: measure one, and give it with --length."
-                if any(gravity)
-                else ""
-            )
         )
     if "mass" in assumed:
         area = float(scene.points.mass.sum() / scene.patches.area.sum())
@@ -417,129 +363,85 @@ def wind_seen(values: Mapping[str, float], videos: Sequence[Footage], simulation
     for video in videos:
         turn = video.cameras[0].world_to_camera[:3, :3].double().cpu()
         right, down, away = (turn @ scene / scene.norm()).tolist()
-        ways = [
-            f"{math.degrees(math.asin(min(1.0, abs(away)))):.0f} degrees {'away from' if away > 0 else 'towards'} it"
-        ]
-        ways += [f"to the {'right' if right > 0 else 'left'}"] if abs(right) > 0.1 else []
+        ways = [f"to the {'right' if right > 0 else 'left'}"] if abs(right) > 0.1 else []
         ways += ["down" if down > 0 else "up"] if abs(down) > 0.2 else []
-        found.append(f"camera {video.name} sees the wind blow {', '.join([*ways[1:], ways[0]])}")
+        angle = math.degrees(math.asin(min(1.0, abs(away))))
+        ways.append(f"{angle:.0f} degrees {'away from' if away > 0 else 'towards'} it")
+        found.append(f"camera {video.name} sees the wind blow {', '.join(ways)}")
     return found
 
 
-def _labelled(shown: Shown) -> Any:
-    """The picture with a line of text above, and what each row is, as a NumPy array."""
-    import numpy as np
-    from PIL import Image, ImageDraw, ImageFont
-
-    width, row = shown.picture.shape[1] // 3, len(shown.picture) // max(len(shown.rows), 1)
-    names = ("video", "simulation", "difference (grey: none)")
-    panels = zip(names, (shown.picture.float() / 255).split(width, 1), strict=True)
-    picture = Image.fromarray(titled(list(panels)))
-    draw, font = ImageDraw.Draw(picture), ImageFont.load_default(13)
-    for number, told in enumerate(shown.rows):
-        where = (6, BAND + number * row + 3)
-        draw.text(where, told, fill=(255, 255, 255), font=font, stroke_width=1, stroke_fill=(0, 0, 0))
-    return np.asarray(picture)
-
-
 def _chosen(video: Footage, times: Sequence[float], fitted: int) -> set[int]:
-    """Numbers of the times whose frames of a video are in its picture, fitted and predicted ones."""
+    """Numbers of the times whose frames are in a picture: up to :data:`SHOWN` fitted and as many predicted ones."""
     own = [k for k, time in enumerate(times) if video.frame_at(time) is not None]
-    parts = [k for k in own if 0 < k < fitted], [k for k in own if k >= fitted]
-    return {k for part in parts for k in _spread(part)} or set(own)
-
-
-def _spread(places: Sequence[int]) -> list[int]:
-    """Up to :data:`SHOWN` of the given numbers, evenly spaced and including the last."""
-    count = min(SHOWN, len(places))
-    return [places[(k + 1) * len(places) // count - 1] for k in range(count)]
+    found: set[int] = set()
+    for part in ([k for k in own if 0 < k < fitted], [k for k in own if k >= fitted]):
+        count = min(SHOWN, len(part))
+        found |= {part[(k + 1) * len(part) // count - 1] for k in range(count)}
+    return found or set(own)
 
 
 def _psnr(squares: Sequence[float]) -> float:
     """PSNR of mean squares [dB], of their mean; NaN for none."""
-    if not squares:
-        return math.nan
-    mean = sum(squares) / len(squares)
-    return -10 * math.log10(mean) if mean > 0 else math.inf
+    mean = sum(squares) / len(squares) if squares else math.nan
+    return -10 * math.log10(mean) if mean != 0 else math.inf
 
 
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; margin: 2em auto; max-width: 70em; padding: 0 1em; color: #222; }
 table { border-collapse: collapse; } td, th { padding: .2em .8em; text-align: right; border-bottom: 1px solid #ddd; }
-td:first-child, .told { text-align: left; } .told { color: #666; }
-video, img { max-width: 100%; border: 1px solid #ddd; }
-video { max-height: 85vh; }
+td:first-child { text-align: left; } video, img { max-width: 100%; border: 1px solid #ddd; } video { max-height: 85vh; }
 .good { color: #06752e; } .doubtful { color: #9a6200; } .failed { color: #b00020; }
 """
 
-_MEANING = {
-    "wind.speed": "speed of the wind",
-    "wind.azimuth": "where it blows, from +x towards +y of the splat with z up",
-    "wind.elevation": "where it blows, above the level",
-    "material.E": "Young's modulus: stiffness",
-    "material.density": "density",
-    "film.start": "start of the motion, in the part of the film that is used",
-}
-_SLOW = "for (const film of document.querySelectorAll('video')) film.playbackRate = 0.5;"
 
+def write_page(folder: Path, result: Fit) -> None:
+    """Write ``page.html``, named after the last two folders of its path, with the films and pictures of the fit."""
+    from PIL import Image
 
-def write_page(folder: Path, result: Result) -> None:
-    """Write ``page.html``, named after the last two folders of its path.
-
-    Args:
-        folder: Where the pictures of the fit are; the page goes there.
-        result: The fit.
-    """
-    name, own = "/".join(folder.resolve().parts[-2:]), [one.camera for one in result.shown]
-    films = [folder / PICTURES / f"film_{camera}.mp4" for camera in own]
-    looked = [folder / BEFORE / f"{kind}_{camera}.png" for kind in ("rest", "tracks") for camera in own]
-    pictures = [*(folder / PICTURES / f"{camera}.png" for camera in own), *(path for path in looked if path.exists())]
+    name = html.escape("/".join(folder.resolve().parts[-2:]))
     failed, doubtful = result.doubts()
+
+    def listed(sentences: Sequence[str]) -> str:
+        return "<ul>" + "".join(f"<li>{html.escape(one)}</li>" for one in sentences) + "</ul>" if sentences else ""
+
+    def packed(data: bytes) -> str:
+        return base64.b64encode(data).decode("ascii")
+
     rows = "".join(
-        f"<tr><td>{html.escape(row['name'])}</td><td class='told'>{html.escape(_MEANING.get(row['name'], ''))}</td>"
-        f"<td>{row['value']:.5g}</td><td>± {row['standard_error']:.2g}</td>"
+        f"<tr><td>{html.escape(row['name'])}</td><td>{row['value']:.5g}</td><td>± {row['standard_error']:.2g}</td>"
         f"<td>{html.escape(row['unit'])}</td><td>{row['low']:g} to {row['high']:g}</td></tr>"
         for row in result.rows()
     )
-    shown = "".join(
-        f'<video src="data:video/mp4;base64,{_packed(film.read_bytes())}" autoplay loop muted controls></video>'
-        for film in films
-    )
-    below = "".join(f"<h3>{html.escape(_title(one))}</h3>{_picture(one)}" for one in pictures)
+    shown, below = "", ""
+    for one in result.shown:
+        film = packed((folder / PICTURES / f"film_{one.camera}.mp4").read_bytes())
+        shown += f'<video src="data:video/mp4;base64,{film}" autoplay loop muted controls></video>'
+        pictures = {
+            f"Film, fit and difference, camera {one.camera}": folder / PICTURES / f"{one.camera}.png",
+            f"Before the fit: the scene at rest, camera {one.camera}": folder / BEFORE / f"rest_{one.camera}.png",
+            f"Before the fit: points that are followed, camera {one.camera}": folder
+            / BEFORE
+            / f"tracks_{one.camera}.png",
+        }
+        for title, path in pictures.items():
+            if path.exists():
+                data = io.BytesIO()
+                Image.open(path).convert("RGB").save(data, format="JPEG", quality=88)
+                told = html.escape(title)
+                below += f'<h3>{told}</h3><img src="data:image/jpeg;base64,{packed(data.getvalue())}" alt="{told}">'
     text = f"""<!doctype html>
-<html lang="en"><meta charset="utf-8"><title>{html.escape(name)}</title><style>{_STYLE}</style>
-<h1>{html.escape(name)}</h1>
+<html lang="en"><meta charset="utf-8"><title>{name}</title><style>{_STYLE}</style>
+<h1>{name}</h1>
 <p class="{result.verdict}"><b>This fit {"has failed" if failed else f"is {result.verdict}"}.</b></p>
-{_list([*failed, *doubtful])}
-<table><tr><th></th><th></th><th>value</th><th>standard error</th><th></th><th>range</th></tr>{rows}</table>
-{_list([*result.seen, *result.assumed])}
+{listed([*failed, *doubtful])}
+<table><tr><th></th><th>value</th><th>standard error</th><th></th><th>range</th></tr>{rows}</table>
+{listed([*result.seen, *result.assumed])}
 <h2>The film beside the fit</h2>
 <p>At half speed. What is called predicted was not fitted.</p>
 {shown}
 <h2>Pictures</h2>
 {below}
-<script>{_SLOW}</script></html>
+<script>for (const film of document.querySelectorAll('video')) film.playbackRate = 0.5;</script></html>
 """
     write_text(folder / "page.html", text)
-
-
-def _list(sentences: Sequence[str]) -> str:
-    return "<ul>" + "".join(f"<li>{html.escape(one)}</li>" for one in sentences) + "</ul>" if sentences else ""
-
-
-def _title(picture: Path) -> str:
-    kind, _, camera = picture.stem.partition("_")
-    titles = {"rest": "Before the fit: the scene at rest", "tracks": "Before the fit: points that are followed"}
-    return f"{titles[kind]}, camera {camera}" if kind in titles else f"Film, fit and difference, camera {picture.stem}"
-
-
-def _picture(path: Path) -> str:
-    from PIL import Image
-
-    data = io.BytesIO()
-    Image.open(path).convert("RGB").save(data, format="JPEG", quality=88)
-    return f'<img src="data:image/jpeg;base64,{_packed(data.getvalue())}" alt="{html.escape(path.stem)}">'
-
-
-def _packed(data: bytes) -> str:
-    return base64.b64encode(data).decode("ascii")

@@ -17,13 +17,14 @@ from torch import Tensor
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.inverse.videos import Footage
 from gaussian_swaying.mpm.state import State
-from gaussian_swaying.rendering.cameras.camera import Camera, project, resized_intrinsics
+from gaussian_swaying.rendering.cameras.camera import Camera, project
 from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.simulation.draw import Painter
 from gaussian_swaying.simulation.simulation import Simulation
 
 WINDOW, WIDE = 15, 960
 """Side of the square that is followed, where the longer side of the picture has at most ``WIDE`` [pixels]."""
+
 
 AROUND = 6.0
 """Border around the windows in which Gaussians are drawn to see how they overlap, in their standard deviations."""
@@ -36,40 +37,6 @@ MANY = 1000
 
 _DRAWN = 1e-3
 """Least sum of the weights of a Gaussian in a picture with which it counts as visible [pixels]."""
-
-
-class Overlap:
-    """The offset between what a splat shows and where it is, all over a picture.
-
-    Args:
-        painter: Draws the picture.
-        gaussians: All Gaussians of it.
-        camera: Its camera.
-    """
-
-    def __init__(self, painter: Painter, gaussians: DeformedGaussians, camera: Camera) -> None:
-        self.camera = camera
-        share = min(1.0, WIDE / max(camera.width, camera.height))
-        width, height = (round(share * side) for side in (camera.width, camera.height))
-        scale = torch.tensor([width / camera.width, height / camera.height], dtype=torch.float64)
-        small = camera.to("cpu", torch.float64)
-        (fx, _, cx), (_, fy, cy), _ = small.intrinsics.tolist()
-        lens, *_ = resized_intrinsics(camera.width, camera.height, fx, fy, cx, cy, width, height)
-        small = replace(small, intrinsics=lens.double(), width=width, height=height)
-        self._small, self._step = small, window_of(width, height) // 2
-        rows, columns = (torch.arange(0, side, self._step) for side in (height, width))
-        places = torch.cartesian_prod(rows, columns).flip(-1) + 0.5
-        found = drawn_beside(painter, gaussians, small.to(painter.device, camera.intrinsics.dtype), places)
-        self._field = (found / scale).T.reshape(1, 2, len(rows), len(columns))
-
-    def at(self, places: Tensor) -> Tensor:
-        """The offset at places in space (N, 3), float64: rendered minus projected pixels, shape (N, 2)."""
-        pixel = project(places, self._small)[0]
-        ends = self._step * (torch.tensor(self._field.shape[:1:-1]) - 1)  # the last column and row
-        grid = 2 * (pixel - 0.5) / ends - 1
-        grid = grid[None, None]
-        found = torch.nn.functional.grid_sample(self._field, grid, padding_mode="border", align_corners=True)
-        return found[0, :, 0].T
 
 
 def drawn_beside(painter: Painter, gaussians: DeformedGaussians, camera: Camera, places: Tensor) -> Tensor:
@@ -95,8 +62,15 @@ def drawn_beside(painter: Painter, gaussians: DeformedGaussians, camera: Camera,
     wide = gaussians.covariances.diagonal(dim1=-2, dim2=-1).amax(-1).sqrt().to(depth)
     size = wide * float(camera.intrinsics[0, 0]) / depth.clamp(min=camera.near)
     small = size < LARGE * window_of(*whole)
-    camera, left, top = _part(camera, pixel, size, small & (depth > camera.near), places)
-    width, height = camera.width, camera.height
+    outer = windows(torch.stack([places.amin(0), places.amax(0)]), *whole)
+    low, high = (torch.stack([end(side) for side in outer]).to(pixel) for end in (torch.min, torch.max))
+    near = size[small & (depth > camera.near) & ((pixel >= low) & (pixel <= high)).all(-1)]
+    border = math.ceil(AROUND * float(near.kthvalue(math.ceil(0.95 * len(near))).values)) if len(near) else 0
+    left, top = (int(end) - border for end in low)  # the windows and what is around them, also beyond the picture
+    width, height = (int(end) + border + 1 - begin for end, begin in zip(high, (left, top), strict=True))
+    lens = camera.intrinsics.clone()
+    lens[:2, 2] -= lens.new_tensor([left, top])
+    camera = replace(camera, intrinsics=lens, width=width, height=height)
 
     def drawn(colours: Tensor) -> Tensor:
         return painter.renderer(gaussians.means, gaussians.covariances, opacity, colours, camera).color
@@ -112,34 +86,9 @@ def drawn_beside(painter: Painter, gaussians: DeformedGaussians, camera: Camera,
     shift = torch.where(counts, sums[:, 1:] / weight - centre, 0.0)
     with torch.no_grad():
         field = drawn(torch.cat([shift, counts.to(shift)], 1)).cpu().double()
-    found = torch.cat(
-        [
-            field[row - top, column - left].mean(1)
-            for column, row in (windows(some, *whole) for some in places.split(MANY))
-        ]
-    )
+    parts = (windows(some, *whole) for some in places.split(MANY))
+    found = torch.cat([field[row - top, column - left].mean(1) for column, row in parts])
     return found[:, :2] / found[:, 2:].clamp(min=1e-6)
-
-
-def _part(camera: Camera, pixel: Tensor, size: Tensor, some: Tensor, places: Tensor) -> tuple[Camera, int, int]:
-    """The camera of some windows and what is around them, also beyond the picture; its left and upper end.
-
-    Args:
-        camera: The camera of the picture.
-        pixel: Centres of the Gaussians [pixels], shape (N, 2).
-        size: Their standard deviations [pixels], shape (N,).
-        some: Those that are to be whole, bool, shape (N,).
-        places: Centres of the windows [pixels], shape (T, 2).
-    """
-    outer = windows(torch.stack([places.amin(0), places.amax(0)]), camera.width, camera.height)
-    low, high = (torch.stack([end(side) for side in outer]).to(pixel) for end in (torch.min, torch.max))
-    near = size[some & ((pixel >= low) & (pixel <= high)).all(-1)]
-    border = math.ceil(AROUND * float(near.kthvalue(math.ceil(0.95 * len(near))).values)) if len(near) else 0
-    left, top = (int(end) - border for end in low)
-    right, bottom = (int(end) + border + 1 for end in high)
-    lens = camera.intrinsics.clone()
-    lens[:2, 2] -= lens.new_tensor([left, top])
-    return replace(camera, intrinsics=lens, width=right - left, height=bottom - top), left, top
 
 
 def window_of(width: int, height: int) -> int:
@@ -216,9 +165,7 @@ def track(simulation: Simulation, video: Footage, most: int = 400, first: Deform
     chosen, start = _chosen(simulation, video, _grey(drawn), most, first)
     images = torch.cat([drawn[None], video.images])
     position, seen = map(torch.from_numpy, follow(images.numpy(), start.numpy()))
-    seen &= _alike(images[:2], position[:2]) > ALIKE
-    if video.itself:  # where the splat shows them is beside their places
-        position += drawn_beside(simulation.painter, first, video.cameras[0].to(simulation.painter.device), start)
+    seen &= alike(images[:2], position[:2]) > ALIKE
     return Tracks(chosen, position[1:], seen[1:])
 
 
@@ -243,7 +190,7 @@ def beside_rest(simulation: Simulation, video: Footage, most: int = 400) -> floa
     return float((off - off.median(0).values).norm(dim=-1).quantile(0.75)) if len(off) else 0.0
 
 
-def _alike(images: Tensor, position: Tensor) -> Tensor:
+def alike(images: Tensor, position: Tensor) -> Tensor:
     """Correlation of the surroundings of points in two pictures (2, H, W, 3) at positions (2, T, 2), shape (T,)."""
     side = window_of(images.shape[2], images.shape[1])
     planes = images.double().mean(-1)[:, None]
@@ -263,10 +210,6 @@ def still_until(simulation: Simulation, video: Footage, tracks: Tracks) -> float
     A point has moved if it is more than :data:`STILL` from where the camera of the frame would see it if it had stayed.
     A quarter of the points has to.
 
-    Args:
-        simulation: The scene.
-        video: The video.
-        tracks: Its tracks.
     """
     scene = simulation.scene
     means = scene.model.means.detach()[scene.moving[tracks.index.to(scene.moving.device)]]
@@ -291,8 +234,7 @@ def match(
     is the case. The offset that remains there comes from a camera that is not quite right: its median is subtracted in
     all frames, unless the video begins in motion.
 
-    Near the border of the object a window shows more border than texture, and the border of a splat is not quite that
-    of the real object. Such Gaussians are left out.
+    Gaussians near the border are left out, as the border of a splat is not quite that of the real object.
 
     Args:
         simulation: The scene.
@@ -335,11 +277,9 @@ def match(
 
 
 def _at_rest(off: Tensor, beside: Tensor) -> tuple[float, Tensor]:
-    """Return the share of the splat's offsets that a video at rest lacks, 0 to 1, and the median of the rest (2,).
+    """Return the share of the splat's offsets (T, 2) that a video at rest lacks, 0 to 1, and the median of the rest.
 
-    Args:
-        off: Offset of the matched positions in the video from the projected centres [pixels], shape (T, 2).
-        beside: From :func:`drawn_beside`, shape (T, 2).
+    ``off`` are those of the matched positions in the video from the projected centres [pixels], shape (T, 2).
     """
     share = float((-(off * beside).sum() / beside.square().sum().clamp(min=1e-12)).clamp(0.0, 1.0))
     return share, (off + share * beside).median(0).values

@@ -53,7 +53,6 @@ class Footage:
         cameras: The camera of each frame; the same one for a tripod.
         images: Frames, dtype uint8, shape (F, H, W, 3).
         masks: Opacity of the object in each frame, dtype uint8, shape (F, H, W); None if it is not known.
-        itself: Whether it is known to show the thing itself, and not what the splat shows.
     """
 
     name: str
@@ -61,7 +60,6 @@ class Footage:
     cameras: tuple[Camera, ...]
     images: Tensor
     masks: Tensor | None = None
-    itself: bool = False
 
     @property
     def size(self) -> tuple[int, int]:
@@ -112,13 +110,7 @@ class _Room:
 
 @dataclass(frozen=True)
 class _Part:
-    """Frames of one camera that are not decoded yet.
-
-    Attributes:
-        begin: Time of the first one [s].
-        read: Decodes them.
-        lost: The picture, if it does not exist.
-    """
+    """Frames of one camera that are not decoded yet, from a time [s] on; ``lost`` is a picture that does not exist."""
 
     begin: float
     read: Callable[[_Room], list[_Shot]]
@@ -133,13 +125,8 @@ def read_videos(
 ) -> list[Footage]:
     """Read the videos of one motion.
 
-    Each folder has a ``transforms.json`` as of Nerfstudio. A frame has ``file_path``, ``transform_matrix``, ``time``
-    [s] and, with several cameras, ``camera``, a name or a number; a transparent image or ``mask_path`` gives the
-    silhouette. An entry with ``video_path`` instead of ``file_path`` is a whole video of a camera that stands still:
-    ``time`` is then that of its first frame, and ``fps`` replaces the frame rate of the file. ``begin`` and ``seconds``
-    [s] choose a part of the film, and only that part is decoded; ``w`` and ``h`` scale it. Lens distortion is removed
-    from both. Cameras that are not wanted are not decoded; the others together may have :data:`MOST_FRAMES` and
-    :data:`MOST_BYTES`.
+    docs/fit.md describes ``transforms.json`` of a folder. Cameras that are not wanted are not decoded; the others
+    together may have :data:`MOST_FRAMES` and :data:`MOST_BYTES`.
 
     Args:
         paths: A folder or a transforms.json, or several. Their times belong to the same clock.
@@ -312,19 +299,13 @@ def check_wide(path: Path, width: int, height: int) -> tuple[int, int]:
 def frames_of(
     path: Path, inputs: Sequence[str] = (), outputs: Sequence[str] = (), grey: bool = False
 ) -> Generator[Any, None, None]:
-    """Read a film at the frame rate that its head states.
+    """Read a film at the frame rate that its head states, with options of ffmpeg for the file and for the frames.
 
     ffmpeg would repeat frames of a film with a variable rate up to a higher one, which the head does not tell.
 
-    Args:
-        path: The file.
-        inputs: Options of ffmpeg for the file.
-        outputs: Options of ffmpeg for the frames.
-        grey: Whether pixels have one byte instead of three.
-
     Yields:
         The head as of imageio-ffmpeg, whose ``fps`` is the rate of the frames (0 if it is not known), then the bytes of
-        each frame.
+        each frame: one a pixel if ``grey``, else three.
     """
     from imageio_ffmpeg import read_frames
 

@@ -248,6 +248,7 @@ class Server:
         self.clients: list[Client] = []
         self._progress: dict[str, Any] | None = {"share": 0.0, "what": "Loading the scene"}
         self._notice = ("", 0.0)
+        self._state: tuple[Any, bytes] = (None, b"")  # the message of the newest state
         self._film: tuple[Any, Film, bytes] | None = None  # the scene that browsers draw, and what it is that of
         self._upload: tempfile.TemporaryDirectory[str] | None = None  # where the splat lies that was loaded
         self._loading = False
@@ -673,9 +674,10 @@ class Server:
                 await client.say(colours)
         if client.free and client.state != (snapshot.number, still):
             client.state = (snapshot.number, still)
-            with session.lock:
-                state = state_message(snapshot, still)
-            await client.say(state)
+            if self._state[0] != client.state:
+                with session.lock:
+                    self._state = client.state, state_message(snapshot, still)
+            await client.say(self._state[1])
 
     def _make_film(self, key: Any, snapshot: Snapshot) -> tuple[Any, Film, bytes]:
         with turn(snapshot.simulation):

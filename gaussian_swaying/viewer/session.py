@@ -9,7 +9,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,7 +31,7 @@ from gaussian_swaying.simulation.body import SimulatedScene, suggest_spacing
 from gaussian_swaying.simulation.measure import FrameDiagnostics, SimulationDiverged
 from gaussian_swaying.simulation.model import find, in_settings, number, of_settings
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.suggestion.cost import Cost, estimate_cost
+from gaussian_swaying.suggestion.cost import estimate_cost
 from gaussian_swaying.suggestion.suggest import QUALITIES, suggest
 
 if TYPE_CHECKING:
@@ -659,61 +659,55 @@ def in_real_time(parser: ArgumentParser, settings: Namespace, simulation: Simula
     made = {configured: (settings, simulation)}
     frames = 1 + max(1, round(MOTION / simulation.frame_dt))
 
-    def measure(dx: float) -> Cost:
+    def cost(dx: float) -> float:
         if dx not in made:
             changed = changed_settings(parser, settings, {"solver.dx": dx})
             made[dx] = changed, Simulation.from_settings(parser, changed)
-        cost = estimate_cost(made[dx][1], frames, budget=BUDGET, pictures=False)
-        return replace(cost, startup_seconds=0.0, dx=dx)
+        found = estimate_cost(made[dx][1], frames, budget=BUDGET, pictures=False)
+        return found.total_seconds - found.startup_seconds
 
     seconds, scene = (frames - 1) * simulation.frame_dt, simulation.scene
     coarsest = suggest_spacing(scene.size * scene.frame.metres_per_unit, 0.0, QUALITIES["draft"])
-    first, found = finest_in_real_time(measure, seconds, configured, coarsest)
-    speeds = seconds / first.total_seconds, seconds / found.total_seconds
-    return Choice(*made[found.dx], sentence(configured, found.dx, *speeds))
+    dx, tried = finest_within(cost, seconds / HEADROOM, configured, coarsest)
+    return Choice(*made[dx], sentence(configured, dx, seconds / tried[configured], seconds / tried[dx]))
 
 
-def finest_in_real_time(
-    measure: Callable[[float], Cost], seconds: float, configured: float, coarsest: float
-) -> tuple[Cost, Cost]:
-    """The cost on the configured grid, and on the finest one that is :data:`HEADROOM` times as fast as real time.
-
-    If none of those tried is so fast, the second is the fastest.
+def finest_within(
+    cost: Callable[[float], float], wish: float, configured: float, coarsest: float = math.inf
+) -> tuple[float, dict[float, float]]:
+    """The finest grid of a few that are tried whose cost is at most a wish, or that of least cost; and all costs.
 
     Args:
-        measure: Function that estimates the cost for a grid spacing [m]; called for few.
-        seconds: Length of the motion whose cost it estimates [s].
-        configured: Smallest grid spacing [m].
+        cost: Cost for a grid spacing [m]; ValueError where the grid is too coarse for the scene, such as for a pin.
+        wish: The largest cost.
+        configured: Smallest grid spacing [m]; its errors are raised.
         coarsest: Largest grid spacing [m]; if it is less than ``configured``, that one is kept.
     """
-    wish, first = seconds / HEADROOM, measure(configured)
-    if first.total_seconds <= wish or configured >= coarsest:
-        return first, first
-    tried = [first]
+    tried = {configured: cost(configured)}
+    if tried[configured] <= wish or configured >= coarsest:
+        return configured, tried
     for _ in range(TRIALS):
         dx = _predicted(tried, wish / MARGIN, configured, coarsest)
-        if any(dx == cost.dx or (cost.total_seconds <= wish and abs(dx / cost.dx - 1) < CLOSE) for cost in tried):
+        if any(dx == known or (took <= wish and abs(dx / known - 1) < CLOSE) for known, took in tried.items()):
             break
         try:
-            tried.append(measure(dx))
-        except ValueError:  # too coarse for a pin, for example
+            tried[dx] = cost(dx)
+        except ValueError:
             coarsest = math.sqrt(configured * dx)
-    fitting = [cost for cost in tried if cost.total_seconds <= wish]
-    if fitting:
-        return first, min(fitting, key=lambda cost: cost.dx)
-    return first, min(tried, key=lambda cost: cost.total_seconds)
+    within = [dx for dx, took in tried.items() if took <= wish]
+    return (min(within) if within else min(tried, key=lambda dx: tried[dx])), tried
 
 
-def _predicted(tried: list[Cost], seconds: float, finest: float, coarsest: float) -> float:
-    """The finest grid spacing on which a motion should take at most some time [m], rounded up to two digits.
+def _predicted(tried: Mapping[float, float], wish: float, finest: float, coarsest: float) -> float:
+    """The finest grid spacing whose cost should be at most a wish [m], rounded up to two digits.
 
-    The time grows with a power of 1 / dx: that between the two grids nearest to the time, or the third of a surface.
+    The cost grows with a power of 1 / dx: that between the two grids nearest to the wish, or the third of a surface.
     """
-    near, *others = sorted(tried, key=lambda cost: abs(math.log(cost.total_seconds / seconds)))
+    near, *others = sorted(tried, key=lambda dx: abs(math.log(tried[dx] / wish)))
     power = SURFACE
-    if others and abs(math.log(others[0].dx / near.dx)) > CLOSE:
-        power = math.log(others[0].total_seconds / near.total_seconds) / math.log(near.dx / others[0].dx)
-    dx = near.dx * (near.total_seconds / seconds) ** (1 / min(max(power, 1.0), 4.0))
+    if others and abs(math.log(others[0] / near)) > CLOSE:
+        power = math.log(tried[others[0]] / tried[near]) / math.log(near / others[0])
+    dx = near * (tried[near] / wish) ** (1 / min(max(power, 1.0), 4.0))
     unit = 10.0 ** (math.floor(math.log10(dx)) - 1)
     return min(max(float(f"{math.ceil(dx / unit - 1e-6) * unit:.2g}"), finest), coarsest)
 

@@ -9,8 +9,9 @@ from PIL import Image
 from shared import refused
 
 from gaussian_swaying.captures.capture_camera import read_views
-from gaussian_swaying.cli.camera import fov_of, main, painter_of
+from gaussian_swaying.cli.camera import main
 from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.inverse.registration import fov_of, painter_of
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.scenes.procedural import FlagScene
 

@@ -8,7 +8,7 @@ from shared import refused
 
 from gaussian_swaying.cli import shipped
 from gaussian_swaying.cli.fit import main
-from gaussian_swaying.inverse.unknowns import read_plan
+from gaussian_swaying.inverse.plan import read_plan
 
 
 def _file(path, **fields):
@@ -52,3 +52,19 @@ def test_the_shipped_fit_is_a_plan():
     file = shipped.with_shipped(["--config", "printed_flag"], "fit")[1]
     plan = read_plan(file, lambda name: shipped.with_shipped(["--config", name], "sim")[1])
     assert plan.unknowns[0].name == "wind.speed"
+
+
+def test_paths_are_relative_to_the_file_that_names_them(tmp_path, monkeypatch):
+    """Those of the base, of the videos and of what is known, from any working directory."""
+    (tmp_path / "case/video").mkdir(parents=True)
+    for name in ("base.yaml", "my.ply"):
+        (tmp_path / "case" / name).write_text("frames: 3\n")
+    file = _file(tmp_path / "case/fit.yaml", base="base.yaml", videos="video", known={"scene.ply": "my.ply"})
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    plan = read_plan(file)
+    assert (*plan.base, *plan.videos, plan.known["scene.ply"]) == tuple(
+        str(tmp_path / "case" / name) for name in ("base.yaml", "video", "my.ply")
+    )
+    missing = read_plan(_file(tmp_path / "case/fit.yaml", base="base.yaml", videos="film"))
+    assert missing.videos == [str(tmp_path / "case/film")]

@@ -14,14 +14,16 @@ from PIL import Image
 from shared import refused, seeded, value_error
 from small_scenes import guess
 
-from gaussian_swaying.cli import fit_film
-from gaussian_swaying.cli.camera import painter_of
+import gaussian_swaying
 from gaussian_swaying.cli.fit import main
-from gaussian_swaying.cli.fit_film import Seen, extent, longest_side, plan_text, upright_in
 from gaussian_swaying.gaussians.formats import read_gaussians
-from gaussian_swaying.inverse.cameras import first_frame, open_film
-from gaussian_swaying.inverse.evidence import HELD_TINT, MOVING
-from gaussian_swaying.inverse.unknowns import SCALE, read_plan
+from gaussian_swaying.inverse import from_film
+from gaussian_swaying.inverse.film import open_film
+from gaussian_swaying.inverse.from_film import Seen, extent, longest_side, plan_text, upright_in
+from gaussian_swaying.inverse.pictures import HELD_TINT, MOVING
+from gaussian_swaying.inverse.plan import read_plan
+from gaussian_swaying.inverse.registration import painter_of
+from gaussian_swaying.inverse.unknowns import SCALE
 from gaussian_swaying.inverse.videos import read_videos
 from gaussian_swaying.recording.video import VideoEncoder
 from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
@@ -68,6 +70,21 @@ def test_the_file_that_a_fit_reads(checked):
     assert (video.cameras[0].position - eye).norm() < 0.02 * eye.norm()
 
 
+def test_a_film_is_fitted_from_python_as_from_the_command_line(case, checked, tmp_path, monkeypatch, capsys):
+    """The same plan in the same places; what has another type is refused."""
+    monkeypatch.setattr(from_film, "run_fit", lambda plan, output, **settings: (plan, output, settings))
+    given = {"up": "+z", "focal": 36.2, "device": "cpu", "progress": False}
+    film, splat, output = case / "film.mp4", case / "my.ply", tmp_path / "out"
+    plan, folder, settings = gaussian_swaying.fit_film(film, splat, output, length=("pole", 2.5), **given)
+    same = read_plan(checked / "fit.yaml")
+    for name in ("unknowns", "known", "assumed", "until", "search"):
+        assert getattr(plan, name) == getattr(same, name)
+    assert (folder, settings["in_use"]) == (output / "result", [output / "fit.yaml"])
+    assert capsys.readouterr().out == ""
+    with pytest.raises((TypeError, ValueError), match="`length` of fit_film"):
+        gaussian_swaying.fit_film(film, splat, output, length=2.5)
+
+
 def test_the_pictures_before_the_fit(checked):
     """The frame and the splat show the same; the pole's edge is held; the free edge is followed."""
     rest = np.asarray(Image.open(checked / "result/before/rest_0.png")).astype(float)[22:]
@@ -98,7 +115,7 @@ def test_a_film_that_does_not_say_its_length(case, checked, tmp_path):
 def seen(case):
     """The first frame with its true camera, and the preview of the splat."""
     film, cloud, camera = open_film(case / "film.mp4"), read_gaussians(case / "my.ply", 0), camera_of(270, 480)
-    return Seen(film, first_frame(film), cloud, camera, painter_of(cloud)(camera), 0.0), guess(cloud)
+    return Seen(film, film.first_frame(), cloud, camera, painter_of(cloud)(camera), 0.0), guess(cloud)
 
 
 def test_known_lengths(seen):
@@ -154,7 +171,7 @@ def test_the_weight_as_a_ruler(case, checked, capsys, monkeypatch):
     found = guess(read_gaussians(case / "my.ply", 0))
     assert found.falls  # a flag is not in balance
     weightless = dataclasses.replace(found, kind="shrub")
-    monkeypatch.setattr(fit_film, "_previewed", lambda *given: weightless)
+    monkeypatch.setattr(from_film, "suggest", lambda *given, **named: weightless)
     assert _check(case, case / "weighed", "--length", "gravity") == 2
     assert "captured in balance" in capsys.readouterr().err
     hangs = dataclasses.replace(found, metres_per_unit=0.5, hold=dataclasses.replace(found.hold, name="top"))
@@ -197,7 +214,7 @@ def test_bad_options(words, told, tmp_path, monkeypatch, capsys):
     ("shown", "told"), [(False, "was not found in the first frame"), (True, "Nothing moves in the film")]
 )
 def test_films_that_do_not_work(case, shown, told, capsys):
-    first = first_frame(open_film(case / "film.mp4")).numpy() if shown else np.full((480, 270, 3), 90, np.uint8)
+    first = open_film(case / "film.mp4").first_frame().numpy() if shown else np.full((480, 270, 3), 90, np.uint8)
     encoder = VideoEncoder(case / "other.mp4", 30)
     for _ in range(5):
         encoder.write(first)
@@ -210,6 +227,6 @@ def test_a_film_is_not_upside_down():
     """A guess that is up in the film, too, stays; else the nearest axis of the splat is taken, or numbers."""
     level = look_at_camera((0.0, -3.0, 1.0), (0.0, 0.0, 0.5), (0, 0, 1), 40.0, 20, 10)
     assert upright_in(level, [0.2, 0.0, 0.9]) is None
-    assert upright_in(level, [0.0, -1.0, 0.0]) == ["+z"]
+    assert upright_in(level, [0.0, -1.0, 0.0]) == [0.0, 0.0, 1.0]
     tilted = look_at_camera((0.0, -3.0, 0.0), (0.0, 0.0, 0.0), (0.7, 0.0, 0.7), 40.0, 20, 10)
-    assert [float(part) for part in upright_in(tilted, [0.0, 0.0, -1.0])] == pytest.approx([0.707, 0, 0.707], abs=0.01)
+    assert upright_in(tilted, [0.0, 0.0, -1.0]) == pytest.approx([0.707, 0, 0.707], abs=0.01)

@@ -2,8 +2,8 @@
 
 import pytest
 
-from gaussian_swaying.inverse.fit import Fit, fit
-from gaussian_swaying.inverse.unknowns import Plan, read_unknown
+from gaussian_swaying.inverse.fit import Problem, fit
+from gaussian_swaying.inverse.plan import Plan, read_unknown
 from gaussian_swaying.inverse.videos import read_videos
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -31,7 +31,7 @@ def fit_of(plan_of, simulation):
 
     def fit_of(unknowns, folder=None, videos=None, further=None, **settings):
         plan = plan_of(unknowns, folder, **settings)
-        return Fit(simulation, videos or read_videos(plan.videos), plan, **(further or {}))
+        return Problem(simulation, videos or read_videos(plan.videos), plan, **(further or {}))
 
     return fit_of
 

@@ -10,16 +10,15 @@ from gaussian_swaying.inverse import evidence
 from gaussian_swaying.inverse.evidence import (
     LEAST_FACING,
     PATCHES,
-    Block,
     Evidence,
     PictureEvidence,
     TrackEvidence,
     compare,
     facing,
-    scales_of,
 )
+from gaussian_swaying.inverse.least_squares import Block, scales_of
 from gaussian_swaying.inverse.tracks import Tracks
-from gaussian_swaying.inverse.unknowns import states_of
+from gaussian_swaying.inverse.variants import states_of
 from gaussian_swaying.inverse.videos import Footage, read_videos
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 
@@ -61,7 +60,8 @@ def test_weighed_tracks_are_those_times_their_weight(own, simulation):
     tracks = Tracks(index, torch.zeros(13, 5, 2).double(), torch.ones(13, 5, dtype=torch.bool))
     states = next(states_of(simulation, [{}], [0.0]))
     plain, weighed = (
-        TrackEvidence(simulation, left, tracks, w).residuals(simulation, states, 0)[0] for w in (False, True)
+        part.beside(part.shown(simulation, states), 0)[0]
+        for part in (TrackEvidence(simulation, left, tracks, w) for w in (False, True))
     )
     normals = simulation.scene.rest().normals[simulation.scene.moving[index]]
     expected = facing(normals, TrackEvidence(simulation, left, tracks).rest, left.cameras[0])

@@ -5,7 +5,7 @@ import torch
 from handheld_films import drift, tripod, write_base
 from shared import peak, seeded
 
-from gaussian_swaying.inverse.cameras import Background, gain_of, gains, with_gains
+from gaussian_swaying.inverse.hand import Background, gain_of, gains, with_gains
 from gaussian_swaying.inverse.videos import Footage
 from gaussian_swaying.simulation.simulation import Simulation
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 from shared import value_error
 
-from gaussian_swaying.inverse import cameras as films
-from gaussian_swaying.inverse.cameras import begins_to_move, first_frame, open_film
+from gaussian_swaying.inverse import film as films
+from gaussian_swaying.inverse.film import begins_to_move, open_film
 from gaussian_swaying.recording.video import VideoEncoder
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.rendering.protocol import RenderOutput
@@ -106,7 +106,7 @@ def test_a_large_film_is_read_in_reduced_size(tmp_path, monkeypatch):
         open_film(narrow)
     film = open_film(_film(tmp_path / "a.mp4", [_square(60)] * 5))
     assert (film.width, film.height, film.full, film.fps) == (80, 48, 2.0, 25.0)
-    frame = first_frame(film)
+    frame = film.first_frame()
     assert frame.shape == (48, 80, 3)
     assert float(frame[5, 5].float().mean()) == pytest.approx(90, abs=4)
 

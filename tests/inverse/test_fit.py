@@ -3,18 +3,34 @@
 import json
 import math
 import shutil
+import time
 from dataclasses import replace
 
 import pytest
+import yaml
 from shared import double, value_error
 from small_films import TRUTH, changed
 
+import gaussian_swaying.inverse.fit as module
+from gaussian_swaying.cli.fit import main
 from gaussian_swaying.inverse.evidence import HELD
-from gaussian_swaying.inverse.fit import GRIDS, ROUNDS, Course, run_fit
-from gaussian_swaying.inverse.unknowns import SHAKEN
+from gaussian_swaying.inverse.fit import GRIDS, ROUNDS, Course, Problem, Say, run_fit
+from gaussian_swaying.inverse.rivals import SHAKEN
 from gaussian_swaying.inverse.videos import read_videos
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")
+
+
+class Said(Say):
+    """Keeps the lines in a list."""
+
+    def __init__(self, lines):
+        super().__init__(False)
+        self.lines = lines
+
+    def __call__(self, line):
+        self.lines.append(line)
+
 
 SPEED, AZIMUTH = {"wind.speed": [2.0, 12.0]}, {"wind.azimuth": [-20.0, 100.0]}
 
@@ -41,7 +57,7 @@ def test_another_end_that_fits_as_well_is_a_rival(fit_of):
 
     def others(*ended):
         made._brief = lambda places, evidence, times: ([end for end, _ in ended], [cost for _, cost in ended])
-        return made._others(here, [far])
+        return made.others(here, [far])
 
     assert others((here, 1.0), (far, 1.04)) == ([made.values(far)], [])
     assert others((here, 1.0), (far, 1.09)) == ([], [])
@@ -50,7 +66,7 @@ def test_another_end_that_fits_as_well_is_a_rival(fit_of):
     assert others((here, 1.0), (far, 1.3)) == ([], [])
     assert others((far, 1.0), (near, 1.3)) == ([made.values(far)], far)
     assert others((near, 1.0)) == ([], [])
-    assert made._others(here, []) == ([], [])  # nothing else is tried
+    assert made.others(here, []) == ([], [])  # nothing else is tried
 
 
 def test_a_softer_and_a_stiffer_material_are_tried_at_the_end(fit_of):
@@ -63,7 +79,7 @@ def test_a_softer_and_a_stiffer_material_are_tried_at_the_end(fit_of):
         return [places[1], places[0]], [1.0, 2.0]
 
     made._brief = brief
-    found, better = made._others([0.5, 0.5], [])
+    found, better = made.others([0.5, 0.5], [])
     assert [place[1] for place in tried] == [0.5, 0.5 - SHAKEN, 0.5 + SHAKEN]
     assert {place[0] for place in tried} == {0.5}
     assert better == [0.5, 0.5 - SHAKEN]
@@ -80,7 +96,7 @@ def test_a_fit_goes_on_from_a_better_end_but_not_for_ever(fit_of, better, rounds
         asked.append((place, rivals))
         return [{"wind.speed": 9.0}], [0.9] * (len(asked) <= better)
 
-    made._others, made.say = others, said.append
+    made.others, made.say = others, Said(said)
     result = made.run(course, lambda course: None)
     assert course.rounds == len(asked) - 1 == rounds
     assert course.rivals == asked[-1][1] == [place for place, _ in asked[:-1]]
@@ -114,12 +130,11 @@ def test_the_error_of_the_grid_is_in_the_standard_errors(own, simulation, fit_of
     made = fit_of(SPEED)
     evidence = made.evidence("tracks")
     place = double([made.plan.unknowns[0].share(5.0)])
-    for _ in range(3):
-        place = double(made.solved(place.tolist(), evidence, made.fitted))
+    place = made.solved(place.tolist(), evidence, made.fitted, 24, True).place
 
     def model(other):
         made.on_grid, made._other_grids = lambda ratio: other, None
-        return float(made._at_the_end(place, evidence)[1])
+        return float(made.grid_covariance(place, evidence))
 
     assert model(simulation) ** 0.5 < 5e-3
     denser = changed(own, material={"density": 27.0})
@@ -171,6 +186,63 @@ def test_stopped_and_continued(fit_of, tmp_path):
     assert [row["cost"] for row in result.history] == [row["cost"] for row in whole.history]
 
 
+@pytest.mark.parametrize("where", ["search", "best_of", "others"])
+def test_a_fit_that_is_stopped_says_how_it_goes_on_and_does(own, tmp_path, capsys, monkeypatch, where):
+    """Also in the search, before the first step, and at the end."""
+    plan = {"base": str(own / "base.yaml"), "videos": str(own / "video"), "unknowns": {"wind.speed": [2.0, 12.0]}}
+    small = {"search": 3, "starts": 1, "iterations": 1, "tracks": 40, "stages": ["tracks"], "until": 0.2}
+    (tmp_path / "fit.yaml").write_text(yaml.safe_dump(plan | small))
+    words = ["--config", str(tmp_path / "fit.yaml"), "--output", str(tmp_path / "fit"), "--device", "cpu"]
+
+    def stopped(*given):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Problem, where, stopped)
+        assert main(words) == 130
+    told = capsys.readouterr().err
+    assert "All steps that were done are kept. To continue:" in told
+    assert told.rstrip().endswith("--resume")
+    assert main([*words, "--resume"]) == 0
+    again = capsys.readouterr()
+    assert "wind.speed" in again.out
+    assert ("] search: wind.speed" in again.err) == (where != "others")
+
+
+def test_what_a_fit_takes_is_said_before_it_starts_and_then_what_is_left(fitted, capsys):
+    fitted(SPEED, search=4, iterations=1, stages=["tracks"], tracks=40, progress=True)
+    told = capsys.readouterr().err
+    for words in ("simulations of 0.208 s: some ", "search:", "frame/s]"):
+        assert words in told
+    assert told.index("simulations of 0.208 s") < told.index("search:")
+    assert "coarser grid" not in told
+
+
+def test_the_time_of_a_fit_is_that_of_all_of_it(fitted, monkeypatch):
+    """By a clock on which films take 1000 s to prepare, and 1000 s to compare with the result."""
+    late, now = [0.0], time.monotonic
+    monkeypatch.setattr("gaussian_swaying.inverse.fit.time.monotonic", lambda: now() + late[0])
+
+    def slow(name):
+        known = getattr(module, name)
+
+        def later(*given):
+            late[0] += 1000.0
+            return known(*given)
+
+        monkeypatch.setattr(module, name, later)
+
+    slow("prepared")
+    slow("predictions")
+    result = fitted(SPEED, search=0, iterations=1, stages=["tracks"], tracks=40)
+    assert result.seconds > 2000.0
+
+
+def test_a_coarser_grid_is_proposed_where_a_fit_takes_long(fit_of, monkeypatch):
+    monkeypatch.setattr("gaussian_swaying.inverse.fit.LONG", 0.0)
+    assert fit_of(SPEED).expected().endswith("less than half of it on a coarser grid (`known: {solver.dx: 0.13}`)")
+
+
 def test_resume_needs_the_same_plan(plan_of, tmp_path):
     plan = plan_of(SPEED, tracks=40, stages=["tracks"], search=0, iterations=1)
     with value_error("nothing to resume"):
@@ -204,8 +276,8 @@ def test_another_grid_that_the_scene_refuses_is_left_out_and_said(simulation, fi
             raise ValueError("`solver.dx` is too small.")
         return simulation
 
-    made = fit_of(SPEED, further={"say": said.append, "on_grid": on_grid})
-    assert made._grids() == made._grids() == [simulation]
+    made = fit_of(SPEED, further={"say": Said(said), "on_grid": on_grid})
+    assert made.grids() == made.grids() == [simulation]
     assert asked == list(GRIDS)
     (line,) = said
     assert (

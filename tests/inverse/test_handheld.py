@@ -1,6 +1,5 @@
 """A hand-held camera: films of a flag in front of walls, from cameras that are known."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -11,13 +10,11 @@ from handheld_films import drift, off, tripod, write_base, write_film
 from shared import double, longest, value_error
 from small_films import TRUTH
 
-from gaussian_swaying.inverse import cameras as registration
-from gaussian_swaying.inverse.cameras import Background, _goes, follow_camera, moves_by, smooth, stands_still
-from gaussian_swaying.inverse.evidence import prepared
 from gaussian_swaying.inverse.fit import fit
+from gaussian_swaying.inverse.hand import Background, follow_camera, moves_by, prepared, smooth, stands_still
 from gaussian_swaying.inverse.tracks import still_until, track
 from gaussian_swaying.inverse.videos import Footage, read_videos
-from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
+from gaussian_swaying.rendering.cameras.camera import project
 from gaussian_swaying.simulation.simulation import Simulation
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")
@@ -41,16 +38,6 @@ def folder(tmp_path_factory):
     return folder
 
 
-@pytest.fixture(scope="module")
-def walls(tmp_path_factory):
-    """A film of the walls themselves, and one of what the splat shows."""
-    folder = tmp_path_factory.mktemp("walls")
-    simulation = Simulation.from_yaml(write_base(folder), device="cpu")
-    write_film(simulation, folder / "real", shaken(tripod(WIDTH, HEIGHT), 6, 1.0), real=True)
-    write_film(simulation, folder / "drawn", shaken(tripod(WIDTH, HEIGHT), 6, 1.0))
-    return folder, simulation
-
-
 @pytest.fixture
 def simulation(folder):
     return Simulation.from_yaml(folder / "base.yaml", device="cpu")
@@ -71,52 +58,6 @@ def test_the_camera_of_each_frame_is_found(film, folder, simulation):
     assert found.unseen == ()
     assert found.residual < 0.4
     assert found.cameras[0].world_to_camera.dtype == video.cameras[0].world_to_camera.dtype
-
-
-@pytest.mark.parametrize("film", ["real", "drawn"])
-def test_the_overlap_of_a_splat_does_not_turn_the_camera(film, walls, monkeypatch):
-    """Its Gaussians show walls by half a pixel beside their places, which a film of the walls does not."""
-    folder, simulation = walls
-    (video,) = read_videos(folder / film)
-    background, true = Background(simulation), shaken(tripod(WIDTH, HEIGHT), 6, 1.0)
-
-    def apart():
-        found = follow_camera(video, background).cameras
-        return np.median([off(one, other) for one, other in zip(found, true, strict=True)], axis=0)
-
-    shares, lacking = [], registration._lacking
-
-    def measured(*given):
-        shares.append(lacking(*given))
-        return shares[-1]
-
-    monkeypatch.setattr(registration, "_lacking", measured)
-    degrees, distance = apart()
-    assert degrees < 0.12
-    assert distance < 0.003
-    assert prepared(simulation, [video])[0][0].itself == (film == "real")
-    del shares[3:]
-    assert shares == pytest.approx([float(film == "real")] * 3, abs=0.25)  # only in the first frame
-    monkeypatch.setattr(registration, "_lacking", lambda *given: float(film != "real"))
-    assert apart()[0] > 0.2
-
-
-def test_another_view_is_another_overlap():
-    """From elsewhere, nearer, or rolled; a shake of half a degree is none."""
-    eye, middle = torch.tensor([0.0, -2.0, 0.5]), torch.tensor([0.0, 0.0, 0.5])
-    camera = look_at_camera(eye, middle, (0, 0, 1), 38.0, WIDTH, HEIGHT, dtype=torch.float64)
-    probes = double([[0.0, 0.0, 0.5], [0.6, 0.0, 0.5], [0.0, 0.0, -0.1], [0.0, -0.6, 0.5]])
-
-    def seen(turn=0.0, near=1.0, roll=0.0, aim=0.0):
-        angle, lean, aside = (math.radians(one) for one in (turn, roll, aim))
-        place = (near * 2 * math.sin(angle), -near * 2 * math.cos(angle), 0.5)
-        up = (math.sin(lean), 0, math.cos(lean))
-        target = (2 * math.tan(aside), 0.0, 0.5)
-        return look_at_camera(place, target, up, 38.0, WIDTH, HEIGHT, dtype=torch.float64)
-
-    assert not _goes(camera, seen(aim=0.5), probes)
-    for other in (seen(turn=6.0), seen(near=0.85), seen(roll=6.0), seen(aim=3.0)):
-        assert _goes(camera, other, probes)
 
 
 def test_only_the_camera_that_moves_is_seen_to_move(folder, simulation):

@@ -5,7 +5,7 @@ import pytest
 import torch
 from small_scenes import plain_cloud
 
-from gaussian_swaying.inverse.cameras import held_end, moving_box, moving_points
+from gaussian_swaying.inverse.film import held_end, moving_box, moving_points
 from gaussian_swaying.inverse.videos import Footage
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.rendering.protocol import RenderOutput

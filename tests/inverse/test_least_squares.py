@@ -1,23 +1,37 @@
 """Least squares on problems whose answers are known."""
 
+import math
+
 import pytest
 import torch
 from shared import double, randn, seeded, value_error
 
-from gaussian_swaying.inverse.evidence import Block, scales_of
-from gaussian_swaying.inverse.fit import (
+from gaussian_swaying.inverse.least_squares import (
+    CLOSELY,
     NO_STEP,
-    Progress,
-    huber,
-    iterate,
+    REACH,
+    Block,
+    DivergedError,
+    _beside,
+    cost_of,
     linearised,
-    normal_equations,
-    sensitivities,
+    scales_of,
+    solve,
 )
 from gaussian_swaying.inverse.unknowns import Unknown, check_apart, condition, directions
 
 TIME = torch.linspace(0, 1, 60, dtype=torch.float64)
 FLOORS = {"tracks": 1e-6}
+
+
+def scaled(sigma):
+    """Standard deviations that stay."""
+    return lambda blocks: {"tracks": sigma}
+
+
+def estimated(blocks):
+    """Those of the residuals."""
+    return scales_of(blocks, FLOORS)
 
 
 def _decay(truth, noise):
@@ -33,24 +47,21 @@ def _decay(truth, noise):
     return lambda places: [Block("tracks", curve(places.double()) - data, cluster)]
 
 
-def _solve(residuals, start, iterations=30):
-    progress = Progress(double(start))
-    while not progress.done and progress.iteration < iterations:
-        iterate(residuals, lambda blocks: scales_of(blocks, FLOORS), progress, 1e-7)
-    return progress
+def _solved(residuals, start, rescale=estimated, most=60):
+    return solve(residuals, rescale, double(start), most, closely=True)
 
 
 def test_outliers_count_little():
     generator = seeded(1)
     noise = 0.01 * randn(60, 2, generator=generator)
     noise[::10] += 3.0  # tracks that jumped to something else
-    found = _solve(_decay([0.4, 0.3], noise), [0.9, 0.9])
-    assert found.done
+    found = _solved(_decay([0.4, 0.3], noise), [0.9, 0.9])
+    assert found.ended
     assert found.place.tolist() == pytest.approx([0.4, 0.3], abs=0.006)
 
 
 def test_a_value_outside_its_range_ends_at_the_end():
-    found = _solve(_decay([0.4, -0.1], torch.zeros(60, 2)), [0.9, 0.9])
+    found = _solved(_decay([0.4, -0.1], torch.zeros(60, 2)), [0.9, 0.9])
     assert float(found.place[1]) == 0.0
     assert 0.8 < float(found.place[0]) < 0.9  # the best constant
 
@@ -62,10 +73,9 @@ def test_standard_errors_are_the_scatter_of_repeated_fits():
         generator = seeded(seed)
         noise = 0.05 * randn(15, 2, generator=generator).repeat_interleave(4, 0)
         residuals = _decay([0.4, 0.3], noise)
-        place = _solve(residuals, [0.5, 0.4]).place
-        normal, _, _ = linearised(residuals, lambda blocks: scales_of(blocks, FLOORS), place)
+        place = _solved(residuals, [0.5, 0.4]).place
         places.append(place)
-        errors.append(normal.covariance().diagonal().sqrt())
+        errors.append(linearised(residuals, estimated, place).covariance().diagonal().sqrt())
     scatter, told = torch.stack(places).std(0), torch.stack(errors).square().mean(0).sqrt()
     assert (told / scatter).tolist() == pytest.approx([1.0, 1.0], abs=0.3)
 
@@ -84,17 +94,18 @@ def test_an_exact_combination_is_named_and_refused():
 
 
 def test_sensitivities_are_exact_to_second_order_and_stay_in_the_range():
+    """Of x^2 + 3 y^2, whose sum of sensitivities times residuals is its square's half derivative."""
+
     def squares(places):
         assert ((places >= 0) & (places <= 1)).all()
-        return [
-            Block("tracks", (places.square() * torch.tensor([1.0, 3.0]))[:, None], torch.zeros(1, dtype=torch.long))
-        ]
+        weighed = places.square() * torch.tensor([1.0, 3.0])
+        return [Block("tracks", weighed[:, None], torch.zeros(1, dtype=torch.long))]
 
-    place = double([0.5, 0.25])
-    blocks, steps = sensitivities(squares, place)
-    slopes = (blocks[0].values[1:] - blocks[0].values[:1])[:, 0] / steps[:, None]
-    assert slopes.diagonal().tolist() == pytest.approx([1.0, 1.5])
-    assert sensitivities(squares, double([0.0, 1.0]))[1].min() > 0
+    normal = linearised(squares, scaled(1.0), double([0.5, 0.25]))
+    assert normal.matrix.diagonal().tolist() == pytest.approx([1.0, 1.5**2])
+    assert normal.gradient.tolist() == pytest.approx([0.25 * 1.0, 0.1875 * 1.5])
+    assert _beside(double([0.0, 1.0]))[1].min() > 0
+    linearised(squares, scaled(1.0), double([0.0, 1.0]))
 
 
 def valley(places):
@@ -105,52 +116,8 @@ def valley(places):
 
 
 def test_the_lowest_place_of_a_narrow_valley_is_found():
-    progress = Progress(double([0.3, 0.081]))
-    while not progress.done and progress.iteration < 60:
-        iterate(valley, lambda blocks: {"tracks": 0.1}, progress, 1e-5)
-    assert progress.place.tolist() == pytest.approx([0.7, 0.441], abs=1e-3)
-
-
-def _steep(places):
-    return [Block("tracks", (10 * (places[:, :1] - 0.2).atan())[:, :, None], torch.zeros(1, dtype=torch.long))]
-
-
-def test_after_a_shorter_step_the_sensitivities_are_those_of_its_end():
-    """Its damping is kept, and lowered after a step at once that is as expected."""
-    seen = []
-
-    def residuals(places):
-        seen.append(len(places))
-        assert ((places >= 0) & (places <= 1)).all()
-        return _steep(places)
-
-    progress = Progress(double([0.3]))
-    far = lambda place, step: place + 8 * step  # noqa: E731
-    iterate(residuals, lambda blocks: {"tracks": 1.0}, progress, 1e-6, retract=far)
-    assert seen == [3, 3, 5, 3]
-    kept = progress.damping
-    assert kept >= 1e-3
-    there, _, _ = linearised(_steep, lambda blocks: {"tracks": 1.0}, progress.place)
-    assert progress.normal.cost == there.cost
-    assert torch.equal(progress.normal.gradient, there.gradient)
-    iterate(residuals, lambda blocks: {"tracks": 1.0}, progress, 1e-6)
-    assert seen[4:] == [3]
-    assert progress.damping < 0.1 * kept
-
-
-def test_a_step_below_the_tolerance_that_is_not_better_is_the_end():
-    """Shorter ones are not tried."""
-    seen = []
-
-    def residuals(places):
-        seen.append(len(places))
-        return _steep(places)
-
-    progress = Progress(double([0.2001]))
-    iterate(residuals, lambda blocks: {"tracks": 1.0}, progress, 1e-3, retract=torch.sub)
-    assert seen == [3, 3]
-    assert progress.done == NO_STEP
-    assert float(progress.place) == 0.2001
+    found = _solved(valley, [0.3, 0.081], scaled(0.1))
+    assert found.place.tolist() == pytest.approx([0.7, 0.441], abs=1e-3)
 
 
 def test_a_rough_valley_ends():
@@ -162,11 +129,84 @@ def test_a_rough_valley_ends():
         values = torch.stack([x - 0.9 + wave, 30 * (y - 0.9 * x.square())], -1)[:, :, None]
         return [Block("tracks", values, torch.arange(2))]
 
-    progress = Progress(double([0.3, 0.081]))
-    while not progress.done and progress.iteration < 40:
-        iterate(rough, lambda blocks: {"tracks": 0.1}, progress, 9e-3, 3e-3)
-    assert progress.done
-    assert progress.iteration < 25
+    found = solve(rough, scaled(0.1), double([0.3, 0.081]), 40)
+    assert found.ended
+    assert found.steps < 25
+
+
+def test_a_wind_across_a_sheet_is_found_in_few_steps():
+    """The wind across is seen forty times as well as that along the sheet, in speed and azimuth a curved valley."""
+    speed, azimuth = Unknown("wind.speed", 0.5, 16.0, "log"), Unknown("wind.azimuth", -80.0, 160.0)
+
+    def components(place):
+        angle = math.radians(azimuth.value(float(place[1])))
+        return [speed.value(float(place[0])) * part for part in (math.cos(angle), math.sin(angle))]
+
+    wanted, across = components([0.5, 0.7]), double([math.cos(0.3), math.sin(0.3)])
+    along = torch.stack([-across[1], across[0]])
+
+    def curved(places):
+        off = double([components(place) for place in places]) - torch.tensor(wanted)
+        values = torch.stack([20 * off @ across, 0.5 * off @ along], -1)
+        return [Block("tracks", values[:, :, None], torch.arange(2))]
+
+    found = _solved(curved, [0.55, 0.45], scaled(1.0))
+    assert found.steps < 30
+    assert found.place.tolist() == pytest.approx([0.5, 0.7], abs=1e-3)
+
+
+def test_no_first_step_is_longer_than_its_reach():
+    tried = []
+
+    def line(places):
+        tried.append(places.clone())
+        return [Block("tracks", 10 * (places - 0.95)[:, :, None], torch.arange(2))]
+
+    _solved(line, [0.1, 0.2], scaled(1.0))
+    first = next(places for places in tried[1:] if len(places) == 1)
+    assert float((first - double([0.1, 0.2])).abs().max()) == pytest.approx(REACH)
+
+
+def test_steps_are_counted_and_run_out():
+    found = solve(valley, scaled(0.1), double([0.3, 0.081]), 2)
+    assert (found.steps, found.ended) == (2, "")
+    again = solve(valley, scaled(0.1), double([0.7, 0.441]), 9, closely=True)
+    assert again.ended
+    assert float((again.place - double([0.7, 0.441])).abs().max()) < CLOSELY[0]
+
+
+def test_where_nothing_is_better_the_place_stays():
+    """Differences that lie: every step goes up, and shorter ones are tried until they are none."""
+
+    def lying(places):
+        values = places if len(places) > 1 else (places - 0.5).abs() + 0.5
+        return [Block("tracks", values[:, :, None], torch.zeros(1, dtype=torch.long))]
+
+    found = _solved(lying, [0.5], scaled(1.0))
+    assert found.ended == NO_STEP
+    assert float(found.place) == 0.5
+
+
+def test_a_variant_that_diverges_is_no_end():
+    """Beyond 0.6 everything is lost; a place that is lost itself is an error."""
+
+    def lost(places):
+        values = torch.where(places < 0.6, places - 0.55, torch.nan)
+        return [Block("tracks", values[:, :, None], torch.zeros(1, dtype=torch.long))]
+
+    assert float(_solved(lost, [0.1], scaled(1.0)).place) == pytest.approx(0.55, abs=1e-3)
+    for work in (lambda: _solved(lost, [0.7], scaled(1.0)), lambda: linearised(lost, scaled(1.0), double([0.7]))):
+        with pytest.raises(DivergedError, match="Every simulation of a step diverged"):
+            work()
+
+
+def _mean(values, cluster, sigma, moment=None):
+    """The covariance of an unknown that is added to each value."""
+
+    def at(places):
+        return [Block("tracks", (values.flatten() + places - 0.5)[..., None], cluster, moment)]
+
+    return linearised(at, scaled(sigma), double([0.5])).covariance()
 
 
 @pytest.mark.parametrize("clusters", [1, 2, 5])
@@ -174,11 +214,9 @@ def test_the_error_of_a_mean_is_that_of_its_clusters_and_of_its_residuals(cluste
     """A mean of C clusters of equal size, in textbooks: variance of their means over C, and sigma^2 / n beside it."""
     size, sigma = 6, 0.2
     draw = randn(clusters, size, generator=seeded(3))
-    values = 0.1 * (draw - draw.mean())  # all below HUBER, and their mean is the best place
+    values = (0.1 * (draw - draw.mean())).double()  # all below HUBER, and their mean is the best place
     cluster = 2 * torch.arange(clusters).repeat_interleave(size)  # every other one is empty
-    variants = torch.stack([values, values + 0.004])  # the unknown is added to each
-    block = Block("tracks", variants.reshape(2, -1, 1), cluster)
-    found = normal_equations([block], {"tracks": sigma}, double([0.004])).covariance()
+    found = _mean(values, cluster, sigma)
     between = values.mean(1).var() / clusters if clusters > 1 else 0.0
     expected = float(between + sigma**2 / (clusters * size))
     assert found.shape == (1, 1)
@@ -189,17 +227,8 @@ def test_errors_that_are_alike_all_over_the_object_count_by_their_time():
     """As clusters: the mean of values that are off by one number in each half of the time."""
     values = double([0.1, -0.1]).repeat_interleave(8)
     cluster, moment = torch.arange(16) % 4, torch.arange(2).repeat_interleave(8)
-    variants = torch.stack([values, values + 0.004])
-    steps = double([0.004])
     sigma = 0.2
-    found = [
-        float(
-            normal_equations(
-                [Block("tracks", variants[..., None], cluster, part)], {"tracks": sigma}, steps
-            ).covariance()
-        )
-        for part in (moment, None)
-    ]
+    found = [float(_mean(values, cluster, sigma, part)) for part in (moment, None)]
     assert found[0] - found[1] == pytest.approx(0.1**2, rel=1e-9)  # 2 / (2 - 1) * 2 * 0.1^2 / 4
     assert found[1] == pytest.approx(sigma**2 / 16, rel=1e-9)
 
@@ -208,13 +237,10 @@ def test_the_cost_is_hubers_function():
     """Against torch's, on both sides of 1.345 standard deviations."""
     sigma = 0.5
     values = double([[0.1, -0.6, 0.67, -0.68, 2.0], [0.0, 1.0, -3.0, 0.5, 0.2]])
-    blocks = [
-        Block("tracks", values[:, :2, None], torch.zeros(2)),
-        Block("tracks", values[:, 2:, None], torch.zeros(3)),
-    ]
+    blocks = [Block("tracks", part[..., None], torch.zeros(part.shape[1])) for part in (values[:, :2], values[:, 2:])]
     expected = torch.nn.functional.huber_loss(
         values / sigma, torch.zeros_like(values), reduction="none", delta=1.345
     ).mean(1)
-    torch.testing.assert_close(huber(blocks, {"tracks": sigma}), expected)
+    torch.testing.assert_close(cost_of(blocks, {"tracks": sigma}), expected)
     values[1, 3] = float("nan")
-    assert huber(blocks, {"tracks": sigma}).tolist() == [pytest.approx(float(expected[0])), float("inf")]
+    assert cost_of(blocks, {"tracks": sigma}).tolist() == [pytest.approx(float(expected[0])), float("inf")]

@@ -6,9 +6,9 @@ from bench.problems.films import shaken
 from handheld_films import drift, tripod, write_base, write_film
 from shared import peak, value_error
 
-from gaussian_swaying.inverse import evidence as module
-from gaussian_swaying.inverse.evidence import Judged, prepared
-from gaussian_swaying.inverse.unknowns import read_plan
+from gaussian_swaying.inverse import hand as module
+from gaussian_swaying.inverse.hand import Judged, prepared
+from gaussian_swaying.inverse.plan import read_plan
 from gaussian_swaying.inverse.videos import read_videos
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -83,5 +83,8 @@ def test_the_fit_file(tmp_path):
     file.write_text(lines)
     assert read_plan(file).hand_held is None
     file.write_text(lines + "hand_held: maybe\n")
-    with value_error(r"`hand_held` in .* to be true or false, but got 'maybe'"):
+    with pytest.raises(TypeError, match=r"`hand_held` of .*fit\.yaml to be true or false or None, but got 'maybe'"):
+        read_plan(file)
+    file.write_text(lines + "wind_changes: true\n")
+    with value_error(r"`fit\.wind_changes` is gone: use `until`"):
         read_plan(file)

@@ -7,7 +7,7 @@ import torch
 from shared import double, randn, seeded, value_error
 
 from gaussian_swaying import Simulation
-from gaussian_swaying.inverse.cameras import cameras_around, find_camera
+from gaussian_swaying.inverse.registration import cameras_around, find_camera
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 from gaussian_swaying.scenes.procedural import FlagScene
 

@@ -7,7 +7,9 @@ import pytest
 import torch
 from small_films import TRUTH
 
-from gaussian_swaying.inverse.unknowns import SCANNED, SHAKEN, apart_by, bent_alike, mirrored, read_unknown, rivals_of
+from gaussian_swaying.inverse.plan import read_unknown
+from gaussian_swaying.inverse.rivals import SCANNED, SHAKEN, bent_alike, mirrored, rivals_of
+from gaussian_swaying.inverse.unknowns import apart_by
 from gaussian_swaying.simulation.model import flow_of
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")
@@ -66,7 +68,7 @@ def test_a_fit_tries_them_at_its_end(simulation, fit_of):
     """The mirror image fits better, so the fit goes on there."""
     made = fit_of({"wind.azimuth": [0.0, 180.0]})
     made._brief = lambda places, evidence, times: (places[::-1], [1.0, 2.0])
-    others, better = made._others([0.3], [])
+    others, better = made.others([0.3], [])
     assert better == rivals_of(simulation.model, made.plan.unknowns, [0.3])[0]
     assert made.values(better)["wind.azimuth"] == pytest.approx(180 - 54, abs=3.0)
     assert others == [made.values(better)]
@@ -77,7 +79,7 @@ def test_the_mirrored_wind_is_a_rival_for_longer(fit_of):
     made = fit_of({"wind.azimuth": [0.0, 180.0]})
     for end, cost, told in ((0.7, 1.2, True), (0.65, 1.2, True), (0.7, 1.3, False), (0.95, 1.2, False)):
         made._brief = lambda places, evidence, times, end=end, cost=cost: ([places[0], [end]], [1.0, cost])
-        others, better = made._others([0.3], [])
+        others, better = made.others([0.3], [])
         assert (others == [made.values([end])], better) == (told, [])
 
 

@@ -9,46 +9,31 @@ import pytest
 import torch
 from shared import double, peak
 
-from gaussian_swaying.inverse.evidence import Block
-from gaussian_swaying.inverse.fit import (
-    NO_STEP,
-    Fit,
-    Progress,
-    expected_gain,
-    iterate,
-    linearised,
-    run_fit,
-    step_from,
-    unsettled,
-)
-from gaussian_swaying.inverse.report import Result, Shown
+from gaussian_swaying.inverse.fit import Problem, run_fit, unsettled
+from gaussian_swaying.inverse.least_squares import NO_STEP, Block, expected_gain, linearised, solve, step_from
+from gaussian_swaying.inverse.report import Fit, Shown
 from gaussian_swaying.inverse.unknowns import Unknown
 
-from .test_least_squares import valley
+from .test_least_squares import scaled, valley
 
 UNKNOWNS = [Unknown("wind.speed", 1.0, 10.0, "log"), Unknown("material.E", 1e3, 1e5, "log")]
-SCALES = {"tracks": 0.1}
+SCALES = scaled(0.1)
 
 
-def _fitted(iterations):
-    progress = Progress(double([0.3, 0.081]))
-    while not progress.done and progress.iteration < iterations:
-        iterate(valley, lambda blocks: SCALES, progress, 1e-5)
-    return progress
-
-
-def _told(progress, ended=None):
-    return unsettled(progress.normal, progress.place, UNKNOWNS, progress.done if ended is None else ended)
+def _told(iterations):
+    """The end of so many steps in the valley, and what is said of it."""
+    found = solve(valley, SCALES, double([0.3, 0.081]), iterations, closely=True)
+    return found, unsettled(linearised(valley, SCALES, found.place), found.place, UNKNOWNS, found.ended)
 
 
 def test_a_fit_in_the_lowest_place_has_settled():
-    progress = _fitted(60)
-    assert progress.done
-    assert _told(progress) == ""
+    found, told = _told(60)
+    assert found.ended
+    assert told == ""
 
 
 def test_iterations_that_ran_out_on_the_way_are_told_with_the_remedy():
-    found = _told(_fitted(1))
+    _, found = _told(1)
     for words in ("not settled", "`iterations` ran out", "raising wind.speed by", "--resume"):
         assert words in found
     assert found.count(". ") == 0
@@ -61,7 +46,7 @@ def test_a_direction_that_nothing_shows_is_not_called_unsettled():
         return [Block("tracks", torch.stack([places[:, 0] - 0.5, 1e-3 * places[:, 1] + 1], -1)[:, :, None], _TWO)]
 
     place = double([0.5, 0.5])
-    normal, _, _ = linearised(flat, lambda blocks: {"tracks": 1.0}, place)
+    normal = linearised(flat, scaled(1.0), place)
     assert peak(step_from(normal, place) - place) > 0.2
     assert unsettled(normal, place, UNKNOWNS, NO_STEP) == ""
 
@@ -74,9 +59,9 @@ def test_the_expected_gain_is_that_of_linear_residuals():
         return [Block("tracks", (places @ torch.tensor([[1.0, 2.0], [0.5, 0.1]]).double() - 0.3)[:, :, None], _TWO)]
 
     place = double([0.2, 0.4])
-    normal, _, _ = linearised(line, lambda blocks: {"tracks": 10.0}, place)
+    normal = linearised(line, scaled(10.0), place)
     target = step_from(normal, place)
-    after, _, _ = linearised(line, lambda blocks: {"tracks": 10.0}, target)
+    after = linearised(line, scaled(10.0), target)
     assert expected_gain(normal, target - place) == pytest.approx(1 - after.cost / normal.cost, abs=1e-6)
 
 
@@ -92,13 +77,10 @@ def test_matches_reach_the_lowest_place_of_a_motion_that_soon_depends_on_everyth
                 found = torch.sin(60 * places * time.square()) - torch.sin(60 * 0.7 * time.square())
                 return [Block("tracks", torch.stack([found, 0 * found], -1), torch.arange(len(time)))]
 
-            progress = Progress(place)
-            while stage == "matches" and not progress.done and progress.iteration < 8:
-                iterate(swing, lambda blocks: SCALES, progress, 1e-5)
-            place = progress.place
+            place = solve(swing, SCALES, place, 8, closely=True).place if stage == "matches" else place
         return float(place[0])
 
-    fit = Fit.__new__(Fit)
+    fit = Problem.__new__(Problem)
     fit.stages = ["tracks", "matches"]
     assert end(fit.steps()) == pytest.approx(0.7, abs=1e-4)
     assert end([("matches", 1.0)] * 3) != pytest.approx(0.7, abs=0.01)
@@ -116,7 +98,7 @@ def test_matches_reach_the_lowest_place_of_a_motion_that_soon_depends_on_everyth
     ],
 )
 def test_no_stage_takes_more_time_than_is_exact_by_then(stages, steps):
-    fit = Fit.__new__(Fit)
+    fit = Problem.__new__(Problem)
     fit.stages = stages
     told = [
         f"{stage} {' '.join(f'{share:g}' for _, share in own)}" for stage, own in groupby(fit.steps(), itemgetter(0))
@@ -127,7 +109,7 @@ def test_no_stage_takes_more_time_than_is_exact_by_then(stages, steps):
 def test_a_camera_that_is_not_followed_is_named():
     picture = torch.zeros(3, 3, 3, dtype=torch.uint8)
     shown = [Shown("left", 24.8, 19.0, 40.7, picture, ("",)), Shown("right", 37.0, 36.0, 40.0, picture, ("",))]
-    result = Result(UNKNOWNS, (0.5, 0.5), 1e-4 * torch.eye(2), (), shown, (), 1.0)
+    result = Fit(UNKNOWNS, (0.5, 0.5), 1e-4 * torch.eye(2), (), shown, (), 1.0)
     assert result.astray == ["left"]
     assert result.verdict == "failed"
     (told,) = [line for line in result.text().splitlines() if "not followed" in line]
@@ -151,7 +133,7 @@ def test_a_camera_that_is_not_followed_is_named():
     ],
 )
 def test_the_verdict_of_a_fit(changes, verdict, words):
-    good = Result(UNKNOWNS, (0.5, 0.5), 1e-4 * torch.eye(2), (), (), (), 1.0, followed={"left": 0.95})
+    good = Fit(UNKNOWNS, (0.5, 0.5), 1e-4 * torch.eye(2), (), (), (), 1.0, followed={"left": 0.95})
     result = replace(good, **changes)
     assert result.verdict == verdict
     assert words in result.text()

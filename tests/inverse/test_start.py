@@ -10,9 +10,10 @@ from shared import double, longest, peak
 from small_films import TRUTH
 
 from gaussian_swaying.inverse.evidence import TrackEvidence, compare, compare_starts
-from gaussian_swaying.inverse.fit import Course, Fit
+from gaussian_swaying.inverse.fit import Course, Problem
 from gaussian_swaying.inverse.tracks import track
-from gaussian_swaying.inverse.unknowns import FILM_START, states_of
+from gaussian_swaying.inverse.unknowns import FILM_START
+from gaussian_swaying.inverse.variants import states_of
 from gaussian_swaying.inverse.videos import read_videos
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")
@@ -95,31 +96,32 @@ def test_a_film_that_begins_in_motion(cut, fitted, tmp_path):
 
 def test_rivals_of_a_film_in_motion_are_judged_by_the_points_of_their_own_first_frames(cut, fit_of, monkeypatch):
     """Points that are followed from where a wrong wind has them speak for that wind; a fit goes on with the better."""
-    made, seen = fit_of(AZIMUTH | {FILM_START: [-0.2, 0.0]}, cut, search=0, iterations=1), []
+    made = fit_of(AZIMUTH | {FILM_START: [-0.2, 0.0]}, cut, search=0, iterations=1)
     sought = made.plan.unknowns
     wrong = [sought[0].share(90.0), sought[1].share(-CUT / 24)]
     true = [sought[0].share(TRUTH["wind.azimuth"]), wrong[1]]
-    shown = Fit._first_shown
+    begun, seen = Problem.begin_at, []
 
-    def first_shown(self):
-        seen.append(list(self.first))
-        return shown(self)
+    def begin_at(self, first):
+        seen.append(list(first))
+        begun(self, first)
 
-    monkeypatch.setattr(Fit, "_first_shown", first_shown)
-    made.first = wrong
+    monkeypatch.setattr(Problem, "begin_at", begin_at)
+    made.begin_at(wrong)
     monkeypatch.setattr("gaussian_swaying.inverse.fit.BRIEF", 0)  # where they are, not where they would go
-    ended, costs = made._each_from_its_own([wrong, true], "tracks")
-    assert seen == [wrong, true]
+    ended, costs = made._brief([wrong, true], None, made.fitted)
+    assert seen == [wrong, wrong, true]
     assert ended == [true, wrong]
     assert costs[1] > 3 * costs[0]
     assert made.first == wrong
-    made._trusted = lambda evidence, place: [
+    made.trusted = lambda evidence, place: [
         p.trusting(torch.full(p.tracks.seen.shape, 0.1 if place == wrong else 1.0)) for p in evidence
     ]
-    less = dict(zip(*(map(str, part) for part in made._each_from_its_own([wrong, true], "tracks")), strict=True))
+    found = made._brief([wrong, true], None, made.fitted)
+    less = dict(zip(*(map(str, part) for part in found), strict=True))
     assert float(less[str(wrong)]) > float(less[str(true)])  # smaller residuals by less trust are no better fit
-    monkeypatch.setattr(made, "_others", lambda place, rivals: ([], [] if made.first == true else true))
-    del made._trusted
+    monkeypatch.setattr(made, "others", lambda place, rivals: ([], [] if made.first == true else true))
+    del made.trusted
     course = Course()
     made.run(course, lambda course: None)
     assert course.first == made.first == true
@@ -134,19 +136,6 @@ def test_the_place_that_a_film_in_motion_begins_from(cut, fit_of, ends):
     azimuth, start = made.values(made.begin_from(places)).values()
     assert azimuth == pytest.approx(TRUTH["wind.azimuth"])
     assert start == pytest.approx(-CUT / 24, abs=0.05)
-
-
-def test_a_changing_wind_in_a_film_in_motion_keeps_the_points(cut, fit_of, monkeypatch):
-    """Also of a fit that was continued: its own were not followed yet, and its place has no changes."""
-    made = fit_of(SPEED | {FILM_START: [-0.2, 0.0]}, cut)
-    made.first = [0.5, made.plan.unknowns[1].share(-CUT / 24)]
-    evidence = made.evidence("tracks")
-    made._tracks = None
-    monkeypatch.setattr(Fit, "solved", lambda self, place, evidence, times: list(place))
-    monkeypatch.setattr("gaussian_swaying.inverse.fit.PREFERRED", 2.0)
-    wider, _ = made._changed(made.first, evidence)
-    assert wider is not made
-    assert wider.tracks is made.tracks
 
 
 def test_a_film_in_motion_is_said(cut, fit_of):

@@ -6,7 +6,7 @@ from shared import in_both, longest, seeded, solid, unit, value_error
 from small_films import base, changed
 
 from gaussian_swaying.gaussians.parts import Part, Parts
-from gaussian_swaying.inverse.unknowns import states_of
+from gaussian_swaying.inverse.variants import states_of
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation import step

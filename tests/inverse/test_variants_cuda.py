@@ -4,7 +4,7 @@ import pytest
 import torch
 from shared import longest
 
-from gaussian_swaying.inverse.unknowns import states_of
+from gaussian_swaying.inverse.variants import states_of
 from gaussian_swaying.simulation.simulation import Simulation
 
 VALUES = [{}, {"wind.speed": 7.0}, {"material.E": 5e3}, {"aero.C_D": 0.4}]

@@ -13,7 +13,7 @@ from small_scenes import together
 from gaussian_swaying.cli.live import session_of
 from gaussian_swaying.gaussians.harmonics import rotate_sh, sh_to_color
 from gaussian_swaying.gaussians.parts import Part, Parts
-from gaussian_swaying.inverse.unknowns import check_variants
+from gaussian_swaying.inverse.variants import check_variants
 from gaussian_swaying.mpm.contact import Contact
 from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.pins import PinnedPoints, PinnedRegion

@@ -10,7 +10,7 @@ import torch
 import yaml
 
 from gaussian_swaying import Simulation
-from gaussian_swaying.inverse.unknowns import read_plan
+from gaussian_swaying.inverse.plan import read_plan
 from gaussian_swaying.inverse.videos import read_videos
 
 from .conftest import beside

@@ -9,7 +9,7 @@ import yaml
 
 from gaussian_swaying import Simulation
 from gaussian_swaying.gaussians.ply import write_ply
-from gaussian_swaying.inverse.unknowns import read_plan
+from gaussian_swaying.inverse.plan import read_plan
 
 from .conftest import beside
 

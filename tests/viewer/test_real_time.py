@@ -6,21 +6,20 @@ from small_scenes import run_cost
 
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer import session
-from gaussian_swaying.viewer.session import HEADROOM, finest_in_real_time, in_real_time, sentence
+from gaussian_swaying.viewer.session import HEADROOM, finest_within, in_real_time, sentence
 
 CONFIGURED, COARSEST = 0.032, 0.075
 
 
 def machine(speed, power):
-    """Costs of 2 s of motion where the configured grid has a speed, which grows with a power of dx; what was tried."""
+    """Seconds for 2 s of motion where the configured grid has a speed, which grows with a power of dx; those tried."""
     tried = []
 
-    def measure(dx):
+    def cost(dx):
         tried.append(dx)
-        seconds, finer = 2.0 / speed, CONFIGURED / dx
-        return run_cost(dx, simulation_seconds=seconds * finer**power, substep_seconds=1e-3 * finer ** (power - 1))
+        return 2.0 / speed * (CONFIGURED / dx) ** power
 
-    return measure, tried
+    return cost, tried
 
 
 @pytest.mark.parametrize("power", [1.0, 2.5, 3.0, 4.0])
@@ -30,54 +29,42 @@ def test_the_finest_grid_in_real_time_is_found_by_few_trials(power):
     A trial aims at a little more than is needed, so the grid is up to a tenth coarser than it could be, or a quarter if
     the time falls with dx itself.
     """
-    before = COARSEST
+    before, wish = COARSEST, 2.0 / HEADROOM
     for speed in (0.01, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0, 1.2, 1.3, 5.0):
-        measure, tried = machine(speed, power)
-        first, found = finest_in_real_time(measure, 2.0, CONFIGURED, COARSEST)
-        reached = 2.0 / found.total_seconds
-        assert first.dx == CONFIGURED <= found.dx <= 1.1 * before
+        cost, tried = machine(speed, power)
+        dx, costs = finest_within(cost, wish, CONFIGURED, COARSEST)
+        assert CONFIGURED <= dx <= 1.1 * before
+        assert list(costs) == tried
         assert len(tried) <= 3
-        if 2.0 / machine(speed, power)[0](COARSEST).total_seconds < HEADROOM:
-            assert found.dx == COARSEST
+        if cost(COARSEST) > wish:
+            assert dx == COARSEST
         else:
-            assert reached >= HEADROOM
-            finer = found.dx / (1.25 if power == 1 else 1.15)
-            assert found.dx == CONFIGURED or 2.0 / measure(finer).total_seconds < HEADROOM
-        before = found.dx
+            assert costs[dx] <= wish
+            assert dx == CONFIGURED or cost(dx / (1.25 if power == 1 else 1.15)) > wish
+        before = dx
     assert before == CONFIGURED
 
 
-def test_a_grid_that_is_fast_enough_is_kept_after_one_trial():
-    measure, tried = machine(1.3, 3.0)
-    finest_in_real_time(measure, 2.0, CONFIGURED, COARSEST)
-    assert tried == [CONFIGURED]
-
-
-def test_a_configured_grid_beyond_the_limit_is_kept():
-    measure, tried = machine(0.1, 3.0)
-    assert finest_in_real_time(measure, 2.0, CONFIGURED, 0.02)[1].dx == CONFIGURED
-    assert tried == [CONFIGURED]
+def test_a_grid_that_is_fast_enough_or_the_limit_is_kept_after_one_trial():
+    for speed, coarsest in ((1.3, COARSEST), (0.1, 0.02)):
+        cost, tried = machine(speed, 3.0)
+        assert finest_within(cost, 2.0 / HEADROOM, CONFIGURED, coarsest)[0] == CONFIGURED
+        assert tried == [CONFIGURED]
 
 
 @pytest.mark.parametrize(("most", "found"), [(0.033, 0.032), (0.041, 0.04), (0.06, 0.055)])
 def test_a_grid_too_coarse_to_start_is_passed_over(most, found):
-    """Of those that could start, the finest that is fast enough, or the fastest."""
-    measure, _ = machine(0.4, 2.5)
+    """Of those that could start, the finest that is fast enough, or the fastest; the configured one must start."""
+    cost, _ = machine(0.4, 2.5)
 
     def limited(dx):
         if dx > most:
             raise ValueError("a pin holds nothing")
-        return measure(dx)
+        return cost(dx)
 
-    assert finest_in_real_time(limited, 2.0, CONFIGURED, COARSEST)[1].dx == pytest.approx(found, abs=1e-4)
-
-
-def test_a_grid_that_cannot_be_configured_is_an_error():
-    def measure(dx):
-        raise ValueError("a pin holds nothing")
-
+    assert finest_within(limited, 2.0 / HEADROOM, CONFIGURED, COARSEST)[0] == pytest.approx(found, abs=1e-4)
     with value_error("a pin holds nothing"):
-        finest_in_real_time(measure, 2.0, CONFIGURED, COARSEST)
+        finest_within(limited, 2.0 / HEADROOM, 2 * most, COARSEST)
 
 
 def test_the_sentence_names_grid_speed_and_how_to_get_the_configured_one():

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.viewer.live_web.block import check
-from gaussian_swaying.viewer.session import changed_settings
+from gaussian_swaying.viewer.session import changed_settings, finest_within
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
@@ -17,10 +16,6 @@ TARGETS = {"phone": 1.1e6, "laptop": 3e6, "desktop": 4.4e6}
 
 SWAYING = 3.0
 """Factor by which a substep by modes takes longer."""
-
-TRIALS = 5
-CLOSE = 0.8  # share of the budget that is good enough
-POWER = 3.5  # of the cost in the spacing: 3 for a sheet, 4 for a solid
 
 
 def load_of(simulation: Simulation) -> float:
@@ -52,40 +47,10 @@ def fitted(parser: ArgumentParser, settings: Namespace, target: str) -> tuple[Si
         check(made[dx])
         return load_of(made[dx])
 
-    dx, found = finest_within(load, configured, budget)
-    speed, points = budget / found, made[dx].model.points.count
+    dx, tried = finest_within(load, budget, configured)
+    speed, points = budget / tried[dx], made[dx].model.points.count
     what = "Kept the configured grid" if dx == configured else f"Chose a grid of {dx:.3g} m instead of {configured:g} m"
     if settings.scene.points == "gaussian":
         what += ", with `scene.points: grid`,"
     fast = f"about {speed:.2g} x real time" if speed < 1 else "real time"
     return made[dx], f"{what} for a {target}: {points:,} points, {fast} expected."
-
-
-def finest_within(load: Callable[[float], float], configured: float, budget: float) -> tuple[float, float]:
-    """The finest grid of those tried whose load is within a budget, and its load; if none is, the one of least load.
-
-    Args:
-        load: Load for a grid spacing [m]; ValueError where the grid is too coarse for the scene.
-        configured: The finest spacing [m].
-        budget: The largest load.
-    """
-    tried = {configured: load(configured)}  # its errors are those of the scene
-    too_coarse = float("inf")
-    dx = configured
-    for _ in range(TRIALS):
-        if CLOSE * budget <= tried[dx] <= budget or (dx == configured and tried[dx] <= budget):
-            break
-        wanted = max(configured, dx * (tried[dx] / (0.9 * budget)) ** (1 / POWER))
-        if wanted >= too_coarse:
-            wanted = (dx * too_coarse) ** 0.5
-        if wanted in tried:
-            break
-        try:
-            tried[wanted] = load(wanted)
-        except ValueError:
-            too_coarse = wanted
-            continue
-        dx = wanted
-    within = [one for one in tried if tried[one] <= budget]
-    best = min(within) if within else min(tried, key=lambda one: tried[one])
-    return best, tried[best]

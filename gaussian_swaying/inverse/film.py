@@ -1,0 +1,325 @@
+"""A film and a splat: its size, when it begins to move, what moves in it, and the end that is held."""
+
+from __future__ import annotations
+
+import math
+import re
+import subprocess
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._inputs import check_regular
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.grouping import connected_parts
+from gaussian_swaying.geometry.neighbours import particle_spacing
+from gaussian_swaying.inverse.registration import LEAST, SOLID, in_space, off_camera
+from gaussian_swaying.inverse.tracks import follow, opencv
+from gaussian_swaying.inverse.videos import Footage, check_wide, frames_of, next_of, scaled
+from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.rendering.protocol import RenderOutput
+
+SIDE, SMALL = 960, 240
+"""Longer side of the frames that are used, at most, and of those in which motion is looked for [pixels]."""
+
+DIFFERENT, MOVED_SHARE = 8.0, 0.02
+"""Grey levels by which a pixel differs that has moved, and the share of such pixels in a frame that has."""
+
+DIAGONAL = math.hypot(36, 24)
+"""Of the film to which a focal length in mm is equivalent [mm]."""
+
+FULL = 0.6
+"""Share of the picture that a splat covers which has surroundings: then most of its points stand still."""
+
+STRAY, IN_A_ROW = 1.5, 3
+"""Distance of a point that moves from where the camera sees it at rest [pixels], and frames in which some do."""
+
+LEAST_SHAKEN = 8
+"""Fewest points of the background that tell how a hand shakes."""
+
+END, FLAT, FEWEST = 0.12, 0.3, 5
+"""Part of an object that is one of its ends, as a share of its length in that direction; least length in a direction
+that has ends, per the largest one; and fewest points that make an end."""
+
+STILL, LEAST_MOTION = 0.35, 3.0
+"""Largest motion of a held end, per that of the liveliest quarter of the points, and the least of these [pixels]."""
+
+LIVELY, MOST = 0.25, 0.5
+"""Motion of what moves, per that of the liveliest fiftieth of the points (the rest is drift of the tracks), and largest
+share of the points that move if there are things around that do not."""
+
+CELLS, PAD = 24, 0.02
+"""Cells along what moves, within two of which things are connected; and what its box is larger, as shares of it."""
+
+_FOCAL = re.compile(r"focal.?length\S*35mm\S*\s*:\s*([0-9.]+)", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Film:
+    """A film that is read in reduced size.
+
+    Attributes:
+        path: The file.
+        width: Of the frames as they are read [pixels].
+        height: Of them.
+        full: Factor by which the film itself is larger.
+        fps: Frames per second.
+        seconds: Its length [s], as the file says; infinite if it says none, as films that browsers record.
+        focal: Focal length that the file says, equivalent to one on 35 mm film [mm]; None if it says none.
+    """
+
+    path: Path
+    width: int
+    height: int
+    full: float
+    fps: float
+    seconds: float
+    focal: float | None = None
+
+    def first_frame(self) -> Tensor:
+        """The first frame, dtype uint8, shape (H, W, 3)."""
+        with closing(frames_of(self.path, outputs=scaled(self.width, self.height))) as frames:
+            head, frame = next_of(frames, self.path), next_of(frames, self.path)
+            return torch.frombuffer(bytearray(frame), dtype=torch.uint8).reshape(*head["size"][::-1], 3)
+
+
+def open_film(path: str | Path, side: float | None = None) -> Film:
+    """Read the head of a film; ``side`` is the longer side of its frames at most [pixels], :data:`SIDE` if left out."""
+    file = check_regular(Path(path), "the film")
+    with closing(frames_of(file)) as frames:
+        head = next_of(frames, file)
+        if head is None or next_of(frames, file) is None:
+            raise ValueError(f"The film {file} has no frames: convert it to mp4.")
+    width, height = head["size"]
+    factor = max(1.0, max(width, height) / (side or SIDE))
+    if not head["fps"] > 0:
+        raise ValueError(f"The film {file} does not say its frame rate: convert it to mp4.")
+    size = check_wide(file, round(width / factor), round(height / factor))
+    return Film(file, *size, factor, head["fps"], float(head["duration"]) or math.inf, _focal(file))
+
+
+def _focal(path: Path) -> float | None:
+    """The focal length among the tags of a film, as phones write it [mm on 35 mm film]."""
+    from imageio_ffmpeg import get_ffmpeg_exe
+
+    words = [get_ffmpeg_exe(), "-hide_banner", "-i", str(path)]
+    told = subprocess.run(words, capture_output=True, stdin=subprocess.DEVNULL, check=False)
+    found = _FOCAL.search(told.stderr.decode(errors="replace"))
+    value = float(found[1]) if found else 0.0
+    return value if 5 <= value <= 1000 else None
+
+
+def view_of_focal(millimetres: float, width: int, height: int) -> float:
+    """Vertical field of view [degrees] of a focal length that is equivalent to so many mm on 35 mm film.
+
+    Example:
+        >>> round(view_of_focal(43.27, 300, 400), 1)
+        43.6
+    """
+    return 2 * math.degrees(math.atan(0.5 * height * DIAGONAL / (millimetres * math.hypot(width, height))))
+
+
+def begins_to_move(film: Film, picture: RenderOutput, camera: Camera) -> float | None:
+    """Time of the first frame in which the object is not as in the first one [s]; None if there is none.
+
+    A hand that shakes moves the background, too, and does not count: what lies around the splat, or most of a splat
+    that fills the picture.
+
+    Args:
+        film: The film; the object is at rest in its first frame. Brighter and darker frames do not count as motion.
+        picture: The splat, drawn from the camera of the first frame.
+        camera: That camera.
+    """
+    import numpy as np
+
+    factor = max(1.0, max(film.width, film.height) / SMALL)
+    size = round(film.width / factor), round(film.height / factor)
+    first: Any = None
+    with closing(frames_of(film.path, outputs=scaled(*size), grey=True)) as frames:
+        width, height = next_of(frames, film.path)["size"]
+        where = picture.alpha[..., 0].detach().cpu().float()[None, None]
+        mask = torch.nn.functional.interpolate(where, size=(height, width), mode="area")[0, 0] > 0.3
+        inside = (mask if bool(mask.any()) else torch.ones_like(mask)).numpy()
+        number, in_a_row, full = 0, 0, inside.mean() > FULL
+        while (frame := next_of(frames, film.path)) is not None:
+            grey = np.frombuffer(frame, dtype=np.uint8).reshape(height, width)
+            if first is None:
+                first, steady = grey, _in_a_room(grey, picture, camera) if full else _steady(grey, inside)
+            in_a_row = in_a_row + 1 if _differs(first, grey, inside) and steady(grey) else 0
+            if in_a_row == (IN_A_ROW if full else 1):
+                return (number + 1 - in_a_row) / film.fps
+            number += 1
+    return None
+
+
+def _differs(first: Any, grey: Any, where: Any) -> bool:
+    """Return whether some pixels of a frame are not those of the first one, but for its brightness."""
+    before, now = (picture[where].astype(float) for picture in (first, grey))
+    level = now * (before.mean() / max(now.mean(), 1.0))
+    return bool((abs(level - before) > DIFFERENT).mean() > MOVED_SHARE)
+
+
+def _steady(first: Any, inside: Any) -> Callable[[Any], bool]:
+    """Tells whether the object is not as in the first frame once the shake of a hand is off, by the background."""
+    import numpy as np
+
+    cv2 = opencv()
+    around = 255 * (cv2.dilate(inside.astype(np.uint8), np.ones((15, 15), np.uint8)) == 0).astype(np.uint8)
+    points = cv2.goodFeaturesToTrack(first, 200, 0.05, 5, mask=around)
+
+    def aligned(grey: Any) -> Any:
+        """A frame, moved and turned onto the first one; as it is if the background has too few points."""
+        if points is None or len(points) < LEAST_SHAKEN:
+            return grey
+        there, found, _ = cv2.calcOpticalFlowPyrLK(first, grey, points, None)
+        kept = found[:, 0] > 0
+        if kept.sum() < LEAST_SHAKEN:
+            return grey
+        turn, _ = cv2.estimateAffinePartial2D(there[kept], points[kept])
+        return grey if turn is None else cv2.warpAffine(grey, turn, grey.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
+
+    return lambda grey: _differs(first, aligned(grey), inside)
+
+
+def _in_a_room(first: Any, picture: RenderOutput, camera: Camera) -> Callable[[Any], bool]:
+    """Tells whether points are not where a camera sees those that stand still, most of a splat that fills the picture.
+
+    The picture is from the camera, which may be larger than the first frame.
+    """
+    import numpy as np
+
+    scale = np.array([camera.width / first.shape[1], camera.height / first.shape[0]])
+    corners = opencv().goodFeaturesToTrack(first, 500, 0.01, 4)
+    start = np.zeros((0, 2)) if corners is None else corners.reshape(-1, 2) + 0.5
+    world, known = in_space(picture, camera, start * scale)
+    intrinsics = camera.intrinsics.double().numpy() / np.array([[scale[0]], [scale[1]], [1.0]])
+
+    def differs(grey: Any) -> bool:
+        (_, there), (_, seen) = follow(np.stack([first, grey])[..., None].repeat(3, -1), start)
+        used = seen & known
+        off = off_camera(world[used], there[used], intrinsics, STRAY)
+        return off is not None and bool((off > STRAY).sum() >= max(LEAST_SHAKEN, MOVED_SHARE * len(off)))
+
+    return differs
+
+
+@dataclass(frozen=True)
+class HeldEnd:
+    """The end that does not move.
+
+    Attributes:
+        name: ``top``, ``bottom``, or ``+x`` to ``-z`` of the splat.
+        direction: Towards it, shape (3,).
+        moves: How far points there move [pixels].
+        others: How far the liveliest quarter moves [pixels].
+    """
+
+    name: str
+    direction: tuple[float, ...]
+    moves: float
+    others: float
+
+
+def held_end(places: Tensor, moved: Tensor, up: Sequence[float]) -> HeldEnd | None:
+    """Find the end of an object that moves least in a film.
+
+    Args:
+        places: Of points on the object, shape (T, 3).
+        moved: How far each goes [pixels], shape (T,).
+        up: Direction that is up, shape (3,).
+
+    Returns:
+        None if no end is much more still than the rest, as in an object that is held at a corner or within.
+    """
+    if len(moved) < 4 * FEWEST or (others := float(moved.quantile(0.75))) < LEAST_MOTION:
+        return None
+    upward = torch.nn.functional.normalize(torch.as_tensor(up, dtype=torch.float64), dim=0)
+    ends = {"top": upward, "bottom": -upward}
+    for axis, name in enumerate("xyz"):
+        if abs(float(upward[axis])) < 0.7:
+            unit = torch.eye(3, dtype=torch.float64)[axis]
+            ends |= {f"+{name}": unit, f"-{name}": -unit}
+    along = {name: places @ direction for name, direction in ends.items()}
+    length = {name: float(own.max() - own.min()) for name, own in along.items()}
+    found = []
+    for name, own in along.items():
+        there = own > own.max() - END * length[name]
+        if length[name] >= FLAT * max(length.values()) and int(there.sum()) >= FEWEST:
+            found.append((float(moved[there].median()), name))
+    if not found or min(found)[0] > STILL * others:
+        return None
+    moves, name = min(found)
+    return HeldEnd(name, tuple(ends[name].tolist()), moves, others)
+
+
+def moving_box(places: Tensor, moved: Tensor, cloud: GaussianCloud) -> tuple[Tensor, Tensor] | None:
+    """The box of what moves among things that do not, and of all that is connected with it.
+
+    Args:
+        places: Of points that the film shows, shape (T, 3).
+        moved: How far each goes [pixels], shape (T,).
+        cloud: The splat.
+
+    Returns:
+        Lower and upper corner [scene units], shape (3,); None if most of what is seen moves, or hardly anything.
+    """
+    goes = moved > max(LEAST_MOTION, LIVELY * float(moved.quantile(0.98))) if len(moved) else moved > 0
+    if not 4 * FEWEST <= int(goes.sum()) <= MOST * len(goes):
+        return None
+    low, high = (places[goes].quantile(share, dim=0) for share in (0.02, 0.98))
+    longest = float((high - low).max())
+    means = cloud.means.double()
+    points = means[((means > low - longest) & (means < high + longest)).all(-1) & (cloud.opacities > 0)]
+    part = connected_parts(points, max(longest / CELLS, 2 * particle_spacing(points)))
+    inside = ((points >= low) & (points <= high)).all(-1)
+    if not bool(inside.any()):
+        return None
+    own = points[part == int(part[inside].mode().values)]
+    return own.amin(0) - PAD * longest, own.amax(0) + PAD * longest
+
+
+def moving_points(video: Footage, picture: RenderOutput) -> tuple[Tensor, Tensor]:
+    """Follow points of a splat through a film, and take the shake of a hand off.
+
+    Args:
+        video: The film; the object is at rest in its first frame.
+        picture: The splat, drawn from the camera of the first frame.
+
+    Returns:
+        The places in the splat of those that are seen for half of the film, (T, 3), and how far each goes at most, (T,)
+        [pixels].
+    """
+    import numpy as np
+
+    cv2: Any = opencv()
+    grey = cv2.cvtColor(video.images[0].numpy(), cv2.COLOR_RGB2GRAY)
+    cover = (picture.alpha[..., 0].detach().cpu().numpy() > SOLID).astype(np.uint8)
+    around = (cv2.dilate(cover, np.ones((31, 31), np.uint8)) == 0).astype(np.uint8)
+    corners = [cv2.goodFeaturesToTrack(grey, 600, 0.01, 5, mask=mask) for mask in (cover, around)]
+    there, beside = (np.zeros((0, 2)) if one is None else one.reshape(-1, 2) + 0.5 for one in corners)
+    position, seen = follow(video.images.numpy(), np.concatenate([there, beside]))
+    world, known = in_space(picture, video.cameras[0], there)
+    outside = position[:, len(there) :], seen[:, len(there) :]
+    position, seen = position[:, : len(there)], seen[:, : len(there)]
+    gone = np.zeros(len(there))
+    K = video.cameras[0].intrinsics.double().numpy()
+    for k in range(1, len(position)):
+        used = known & seen[k]
+        if len(beside) < LEAST and cover.mean() > FULL:
+            far = off_camera(world[used], position[k, used], K, LEAST_MOTION)
+        else:
+            start = position[0]
+            if len(beside) >= LEAST:  # what lies around the splat
+                moved, valid = outside[0][k], outside[1][k]
+                turn = cv2.estimateAffinePartial2D(outside[0][0][valid], moved[valid], ransacReprojThreshold=1.5)[0]
+                start = start if turn is None else start @ turn[:, :2].T + turn[:, 2]
+            far = np.linalg.norm(position[k] - start, axis=-1)[used]
+        if far is not None:
+            gone[used] = np.maximum(gone[used], far)
+    kept = known & (seen.mean(0) > 0.5)
+    return torch.from_numpy(world[kept]), torch.from_numpy(gone[kept])

@@ -1,0 +1,410 @@
+"""Films from a hand: the camera and the brightness of each frame, from what stands still in the splat."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying.geometry.rotations import rotation_of
+from gaussian_swaying.inverse.registration import LEAST, SOLID, Registration, grey_of, refine
+from gaussian_swaying.inverse.tracks import STILL, follow, opencv
+from gaussian_swaying.inverse.videos import Footage
+from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.rendering.protocol import RenderOutput
+from gaussian_swaying.simulation.simulation import Simulation
+
+SHARE = 0.02
+"""Share of a pixel from which what moves is seen in it."""
+
+REACH = 0.25
+"""Distance that what is simulated is expected to go, as a share of its longer side in the picture. What goes farther is
+left to the robust estimates."""
+
+LOOKS = 8
+"""Frames that are compared with the first one to see whether a camera moves."""
+
+DRAWN, FIRST = 2, 4
+"""Pictures that are drawn for a frame, and for the first one."""
+
+AGREE, MANY = 0.25, 0.2
+"""Least share of the points of a frame that agree on its camera, and share of the frames without background above which
+a fit is doubtful."""
+
+BLOCK = 4
+"""Side of the squares over which colours are averaged [pixels], so that edges, noise and compression count little."""
+
+DARK, BRIGHT = 8, 247
+"""Mean grey level up to which a square tells nothing, and that of a pixel from which it may be cut off."""
+
+FEWEST_SQUARES = 50
+"""Fewest squares that make a gain."""
+
+
+class Background:
+    """Draws a scene at rest, and says which pixels show what stands still.
+
+    Args:
+        simulation: The scene. What it moves is no background.
+        also_moves: Names of parts of its splat that move in the film, too, though the simulation does not move them.
+
+    Raises:
+        ValueError: If there is no such part.
+    """
+
+    def __init__(self, simulation: Simulation, also_moves: Sequence[str] = ()) -> None:
+        scene = simulation.scene
+        self._painter, self._rest = simulation.painter, scene.rest()
+        simulated = torch.zeros(len(self._rest.means), dtype=torch.bool)
+        simulated[scene.moving.cpu()] = True
+        named = torch.zeros_like(simulated)
+        for name in also_moves:
+            if scene.parts is None:
+                raise ValueError(
+                    f"`also_moves` names the part {name!r}, but the scene has no parts: set `scene.parts` in the base."
+                )
+            named |= scene.parts.mask(name)[scene.drawn]
+        self.exists = not bool((simulated | named).all())
+        self._moves = torch.stack([simulated, named, named], 1).to(self._rest.means)
+
+    def draw(self, camera: Camera) -> tuple[RenderOutput, Tensor]:
+        """The picture of the scene at rest, and its background: bool, on the CPU, shape (H, W)."""
+        painter, rest = self._painter, self._rest
+        camera = camera.to(painter.device)
+        with torch.no_grad():
+            picture = painter.picture(rest, camera)
+            drawn = painter.renderer(rest.means, rest.covariances, painter.opacity(), self._moves, camera).color
+        simulated, named, _ = (drawn > SHARE).cpu().unbind(-1)
+        return picture, (picture.alpha[..., 0].cpu() > SOLID) & ~_widened(simulated) & ~named
+
+
+def _widened(moving: Tensor) -> Tensor:
+    """A mask (H, W) with all that is nearer to it than what moves is expected to go."""
+    cv2 = opencv()
+    rows, columns = moving.nonzero().unbind(1)
+    if not len(rows):
+        return moving
+    side = 1 + max(int(rows.max() - rows.min()), int(columns.max() - columns.min()))
+    return torch.from_numpy(cv2.distanceTransform((~moving).byte().numpy(), cv2.DIST_L2, 5)) <= REACH * side
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """The cameras of a film.
+
+    Attributes:
+        cameras: The camera of each frame.
+        unseen: Frames that show too little of the background; their cameras lie between those of their neighbours.
+        residual: Median over the frames of the root mean square distance of the points that agree [pixels].
+    """
+
+    cameras: tuple[Camera, ...]
+    unseen: tuple[int, ...]
+    residual: float
+
+
+def moves_by(video: Footage, background: Background) -> float:
+    """Distance that the background goes in the film of a camera that is said to stand still [pixels].
+
+    It is the median over points and the largest of :data:`LOOKS` frames. Of each point only the motion across its edge
+    counts, as nothing holds it along a plain pole. 0 if the background has too few points.
+    """
+    import numpy as np
+
+    cv2 = opencv()
+    _, still = background.draw(video.cameras[0])
+    first = grey_of(video.images[0])
+    corners = cv2.goodFeaturesToTrack(first, 300, 0.01, 7, mask=still.byte().numpy())
+    if corners is None or len(corners) < LEAST:
+        return 0.0
+    start, most = corners.reshape(-1, 2) + 0.5, 0.0
+    column, row = corners.reshape(-1, 2).round().astype(int).T
+    across = cv2.cornerEigenValsAndVecs(first, 7, 3)[row, column, 2:4]
+    last = len(video.times) - 1
+    for k in sorted({round(last * (n + 1) / LOOKS) for n in range(LOOKS)}):
+        pair = np.stack([first, grey_of(video.images[k])])[..., None].repeat(3, -1)
+        position, seen = follow(pair, start)
+        if seen[1].sum() >= LEAST:
+            most = max(most, float(np.median(abs(((position[1] - start) * across)[seen[1]].sum(-1)))))
+    return most
+
+
+def stands_still(video: Footage) -> bool:
+    """True if all frames of a video are said to have the same camera."""
+    views = torch.stack([camera.world_to_camera for camera in video.cameras])
+    return bool((views == views[:1]).all())
+
+
+def follow_camera(
+    video: Footage, background: Background, tick: Callable[[int], object] = lambda frames: None
+) -> Motion:
+    """Find the camera of each frame.
+
+    Args:
+        video: The film. Its cameras may be those of the first frame, or rough ones of all frames.
+        background: What stands still.
+        tick: Called with 1 after each frame.
+    """
+    found: list[Registration | None] = []
+    last: Camera | None = None
+    for k, given in enumerate(video.cameras):
+        camera = given if last is None else _carried(given, video.cameras[k - 1], last)
+        seen = None
+        for _ in range(FIRST if last is None else DRAWN):
+            picture, still = background.draw(camera)
+            seen = refine(video.images[k], picture, camera, still)
+            if seen is None or seen.agreeing < AGREE * seen.matches:
+                seen = None
+                break
+            camera = seen.camera
+        last = camera
+        found.append(seen)
+        tick(1)
+    unseen = tuple(k for k, camera in enumerate(found) if camera is None)
+    if 2 * len(unseen) > len(found):
+        raise ValueError(
+            f"The camera {video.name!r} moves, but {len(unseen)} of its {len(found)} frames show too little of what "
+            "stands still in the splat: stand it on a tripod, or film something still and textured, too, and have it "
+            "in the splat."
+        )
+    picture, still = background.draw(video.cameras[0])
+    depth = (picture.depth / picture.alpha.clamp(min=1e-3))[..., 0].cpu()
+    far = float(depth[still if bool(still.any()) else depth > 0].median())
+    like = video.cameras[0]
+    middle = like.position.double().cpu() + far * like.world_to_camera[2, :3].double().cpu()
+    views = [
+        (camera, camera.world_to_camera.to(like.world_to_camera)) for camera in smoothed(found, video.times, middle)
+    ]
+    residual = torch.tensor([one.residual for one in found if one is not None]).median()
+    return Motion(tuple(replace(camera, world_to_camera=view) for camera, view in views), unseen, float(residual))
+
+
+def smoothed(found: Sequence[Registration | None], times: Sequence[float], pivot: Tensor) -> list[Camera]:
+    """Smooth cameras in time, and fill in those that are missing (None) from their neighbours.
+
+    Six numbers are smoothed: the rotation, and where the camera sees a point in the middle of the background, ``pivot``
+    (3,) [scene units]. An error of the rotation hardly changes the latter.
+    """
+    import numpy as np
+
+    known = [(time, one) for time, one in zip(times, found, strict=True) if one is not None]
+    moments, base = [time for time, _ in known], known[0][1].camera.world_to_camera[:3, :3]
+    numbers, errors = torch.zeros(2, len(known), 6, dtype=torch.float64)
+    for k, (_, one) in enumerate(known):
+        view = one.camera.world_to_camera
+        seen, turn = view[:3, :3] @ pivot, view[:3, :3] @ base.T
+        numbers[k] = torch.cat([torch.from_numpy(opencv().Rodrigues(turn.numpy())[0][:, 0]), seen + view[:3, 3]])
+        change = torch.eye(6, dtype=torch.float64)
+        change[3:, :3] = -torch.linalg.cross(seen.expand(3, 3), torch.eye(3, dtype=torch.float64)).T
+        errors[k] = (change @ one.spread @ change.T).diagonal().sqrt()
+    own = [smooth(*pair) for pair in zip(numbers.T.numpy(), errors.T.numpy(), strict=True)]
+    filled = torch.from_numpy(np.stack([np.interp(times, moments, one) for one in own], 1))
+    result = []
+    for turn, place in zip(*filled.split(3, 1), strict=True):
+        view = torch.eye(4, dtype=torch.float64)
+        view[:3, :3] = rotation_of(turn) @ base
+        view[:3, 3] = place - view[:3, :3] @ pivot
+        result.append(replace(known[0][1].camera, world_to_camera=view))
+    return result
+
+
+def smooth(values: Any, errors: Any) -> Any:
+    """The most likely course of a number whose second differences are random, seen with noise.
+
+    It minimises the sum of squares of noise over its standard error and of second differences over their standard
+    deviation, which has the largest marginal likelihood of a grid.
+
+    Args:
+        values: What was seen at equal steps of time, NumPy array, float64, shape (N,).
+        errors: Standard errors, shape (N,).
+
+    Returns:
+        Shape (N,); with fewer than four values these.
+    """
+    import numpy as np
+    from scipy.linalg import cho_solve_banded, cholesky_banded
+
+    count = len(values)
+    if count < 4:
+        return values
+    rough, difference = np.zeros((3, count)), (1.0, -2.0, 1.0)
+    for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2)):  # upper bands of the squares of second differences
+        rough[2 - j + i, j : count - 2 + j] += difference[i] * difference[j]
+    weights, best, found = errors**-2.0, -np.inf, values
+    for variance in np.median(errors) ** 2 * np.logspace(-6, 6, 49):
+        bands = rough / variance
+        bands[2] += weights
+        factor = cholesky_banded(bands)
+        course = cho_solve_banded((factor, False), weights * values)
+        likelihood = (weights * values * course).sum() - 2 * np.log(factor[2]).sum() - (count - 2) * np.log(variance)
+        if likelihood > best:
+            best, found = likelihood, course
+    return found
+
+
+def _carried(given: Camera, before: Camera, found: Camera) -> Camera:
+    """A camera moved from the last frame's, which was found, as the given ones move; still if they are."""
+    there, then, now = (c.world_to_camera.double().cpu() for c in (found, before, given))
+    return replace(given, world_to_camera=now @ torch.linalg.inv(then) @ there, intrinsics=found.intrinsics)
+
+
+def gains(video: Footage, background: Background) -> tuple[Tensor, tuple[int, ...]] | None:
+    """Brightness of each frame over that of the splat, by colour.
+
+    Args:
+        video: The film, with the camera of each frame.
+        background: What stands still.
+
+    Returns:
+        Gains of red, green and blue, float64, shape (F, 3), and the frames that show too little of the background,
+        which have those of their neighbours. None if all do.
+    """
+    import numpy as np
+
+    found: list[Tensor | None] = []
+    drawn: tuple[Camera, Tensor, Tensor] | None = None
+    for camera, image in zip(video.cameras, video.images, strict=True):
+        if drawn is None or drawn[0] is not camera:
+            picture, still = background.draw(camera)
+            drawn = (camera, 255 * picture.color.cpu().double(), still)
+        found.append(gain_of(image.double(), *drawn[1:]))
+    known = [k for k, one in enumerate(found) if one is not None]
+    if not known:
+        return None
+    rows = np.stack([one.numpy() for one in found if one is not None])
+    filled = [np.interp(video.times, [video.times[k] for k in known], own) for own in rows.T]
+    return torch.from_numpy(np.stack(filled, 1)), tuple(k for k, one in enumerate(found) if one is None)
+
+
+def gain_of(image: Tensor, picture: Tensor, still: Tensor) -> Tensor | None:
+    """The gain of each colour, float64, shape (3,), between a picture and an image of grey levels up to 255 (H, W, 3).
+
+    It is the median over squares of the mask ``still`` (H, W), weighed by their brightness in the picture, which
+    minimises the sum of distances. None if there are too few squares.
+    """
+    inside = _averaged(still.double()[..., None])[:, 0] == 1
+    seen, wanted = _averaged(image), _averaged(picture)
+    cut = _averaged((torch.maximum(image, picture) >= BRIGHT).double())
+    inside &= ((seen > DARK) & (wanted > DARK) & (cut == 0)).all(1)
+    if int(inside.sum()) < FEWEST_SQUARES:
+        return None
+    found = []
+    for real, drawn in zip(seen[inside].T, wanted[inside].T, strict=True):
+        order = (real / drawn).argsort()
+        total = drawn[order].cumsum(0)
+        found.append((real / drawn)[order[int(torch.searchsorted(total, 0.5 * total[-1]))]])
+    return torch.stack(found)
+
+
+def with_gains(images: Tensor, found: Sequence[Tensor] | Tensor) -> Tensor:
+    """Frames (F, H, W, 3), uint8, divided by their gains (F, 3)."""
+    out = torch.empty_like(images)  # a film may be large: no second list of its frames
+    for one, image, gain in zip(out, images, found, strict=True):
+        one.copy_((image.float() / gain.float()).round().clamp(0, 255))
+    return out
+
+
+def _averaged(picture: Tensor) -> Tensor:
+    """Means over squares of a picture (H, W, C), shape (N, C)."""
+    return torch.nn.functional.avg_pool2d(picture.permute(2, 0, 1)[None], BLOCK)[0].flatten(1).T
+
+
+@dataclass(frozen=True)
+class Judged:
+    """The judgement of the background on the film of a camera.
+
+    Attributes:
+        camera: Name of the camera.
+        frames: Number of its frames.
+        moved: Distance that the background goes in the film of a camera that is said to stand still [pixels].
+        hand_held: Whether the camera of each frame was found.
+        residual: Median distance of points of the background from where these cameras see them [pixels].
+        unseen: Number of frames that show too little of the background; they have the camera of their neighbours.
+        gains: Smallest and largest gain of red, green and blue, shape (2, 3); empty if it is not known.
+    """
+
+    camera: str
+    frames: int
+    moved: float = 0.0
+    hand_held: bool = False
+    residual: float = 0.0
+    unseen: int = 0
+    gains: tuple[tuple[float, ...], ...] = ()
+
+    def sentences(self) -> list[str]:
+        found = []
+        if self.hand_held:
+            found.append(
+                f"camera {self.camera}: held in a hand; its background goes {self.moved:.3g} pixels. The camera of "
+                f"each frame was found, {self.residual:.2f} pixels off"
+                + (f"; {self.unseen} of {self.frames} frames have that of their neighbours." if self.unseen else ".")
+            )
+        if self.gains:
+            rows = zip(("red", "green", "blue"), *self.gains, strict=True)
+            told = ", ".join(f"{name} {low:.2f} to {high:.2f}" for name, low, high in rows)
+            found.append(f"camera {self.camera}: as bright as the splat now; the frames were divided by {told}.")
+        return found
+
+    def doubts(self) -> list[str]:
+        if self.unseen <= MANY * self.frames:
+            return []
+        return [
+            f"camera {self.camera}: {self.unseen} of {self.frames} frames show too little of what stands still, and "
+            "have the camera of their neighbours: film more of it, or from a tripod."
+        ]
+
+
+def prepared(
+    simulation: Simulation,
+    videos: Sequence[Footage],
+    hand_held: bool | None = None,
+    also_moves: Sequence[str] = (),
+    say: Callable[[str], None] = lambda line: None,
+    tick: Callable[[int], object] = lambda frames: None,
+) -> tuple[list[Footage], list[Judged]]:
+    """Find the camera of each frame of films from a hand, and take drifts of exposure and white balance off all films.
+
+    Args:
+        simulation: The scene.
+        videos: The films.
+        hand_held: Whether their cameras move otherwise than they are said to. None: those whose frames all have one
+            camera, but whose background moves by more than half a pixel.
+        also_moves: Names of parts of the splat that move in the films, though the simulation does not move them.
+        say: Called with a line for each thing that is done.
+        tick: Called with the number of frames whose camera was found.
+
+    Returns:
+        The films, and what the background says of each; nothing if the splat has none.
+    """
+    background = Background(simulation, also_moves)
+    if not background.exists:
+        if hand_held:
+            raise ValueError(
+                "`hand_held` needs something that stands still in the splat, but all of it moves: stand the camera on "
+                "a tripod, or have something still and textured, too, in the film and in the splat."
+            )
+        return list(videos), []
+    if not hand_held and find_spec("cv2") is None:
+        say("Without OpenCV nothing says whether a camera moves, or its exposure drifts.")
+        return list(videos), []
+    found, judged = [], []
+    for video in videos:
+        one = Judged(video.name, len(video.times))
+        if hand_held is not False and stands_still(video):
+            one = replace(one, moved=moves_by(video, background))
+        if hand_held or (one.moved > STILL and hand_held is None):
+            motion = follow_camera(video, background, tick)
+            video = replace(video, cameras=motion.cameras)
+            one = replace(one, hand_held=True, residual=motion.residual, unseen=len(motion.unseen))
+        if (bright := gains(video, background)) is not None:
+            video = replace(video, images=with_gains(video.images, bright[0]))
+            one = replace(one, gains=tuple(tuple(end.tolist()) for end in (bright[0].amin(0), bright[0].amax(0))))
+        for line in one.sentences():
+            say(line)
+        found.append(video)
+        judged.append(one)
+    return found, judged

@@ -1,0 +1,366 @@
+"""The camera of a frame, from the splat that it shows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gaussian_swaying._checks import check_whole
+from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.harmonics import SH_DC
+from gaussian_swaying.gaussians.measures import Gaussians
+from gaussian_swaying.geometry.covariances import covariance
+from gaussian_swaying.geometry.origin import Origin
+from gaussian_swaying.inverse.tracks import follow, opencv, window_of
+from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
+from gaussian_swaying.rendering.protocol import RenderOutput
+from gaussian_swaying.suggestion.up import guess_up
+
+RATIO = 0.8
+"""Largest distance of a feature to its match, per that to the next best one (Lowe 2004)."""
+
+NEAR, CLOSE = 0.006, 1.5
+"""Largest distance between a point and its match that agree on a camera, as a share of the picture's diagonal, and that
+of points that are followed on thin things [pixels]."""
+
+LEAST, ENOUGH = 12, 60
+"""Fewest matches that make a camera, and features that agree with which none need to be followed."""
+
+SOLID = 0.9
+"""Least opacity of the picture at a feature, whose depth is then known."""
+
+REFINED, ROUNDS = 5, 3
+"""Times that a camera is refined and the points that agree on it are chosen anew, and pictures that are drawn from a
+camera that is already near, for features and for points that are followed."""
+
+VIEW, ROOM = 50.0, 1.3
+"""Vertical field of view with which a search begins if it is not known [degrees], and distance of the first cameras,
+per that at which the object fills the picture."""
+
+PICTURE, CAMERAS = "registration.png", "transforms.json"
+STILLS = (".png", ".jpg", ".jpeg")
+Draw = Callable[[Camera], RenderOutput]
+"""Draws the splat, at rest."""
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """The camera of a frame.
+
+    Attributes:
+        camera: The camera.
+        matches: Points that were matched at the end.
+        agreeing: Those that agree on the camera.
+        residual: Root mean square of their distances [pixels].
+        spread: Covariance of a small rotation of the camera's axes [rad], and of a shift along them [scene units],
+            float64, shape (6, 6). Points nearer than the window in which they are followed count as one.
+    """
+
+    camera: Camera
+    matches: int
+    agreeing: int
+    residual: float
+    spread: Tensor
+
+
+def painter_of(cloud: GaussianCloud) -> Draw:
+    """A function that draws a splat on black, in the colours that it has from all sides."""
+    from gaussian_swaying.rendering.gsplat_renderer import make_renderer
+
+    renderer = make_renderer(torch.device("cpu"))
+    shape, colour = covariance(cloud.quats, cloud.scales), (0.5 + SH_DC * cloud.sh[:, 0]).clamp(0, 1)
+
+    def draw(camera: Camera) -> RenderOutput:
+        with torch.no_grad():
+            return renderer(cloud.means, shape, cloud.opacities.sigmoid(), colour, camera.to(dtype=torch.float32))
+
+    return draw
+
+
+def first_cameras(
+    cloud: GaussianCloud, up: Sequence[float] | None, fov: float, width: int, height: int
+) -> list[Camera]:
+    """Cameras around a splat, from which it fills the picture; ``fov`` is vertical [degrees]."""
+    splat, draw = Gaussians.of(cloud), torch.Generator().manual_seed(0)
+    up = guess_up(splat)[0].direction if up is None else up
+    chosen = cloud.means[torch.multinomial(torch.from_numpy(splat.weight), 10_000, replacement=True, generator=draw)]
+    low, high = (torch.quantile(chosen, share, dim=0) for share in (0.02, 0.98))
+    narrow = math.tan(math.radians(fov) / 2) * min(1.0, width / height)
+    distance = ROOM * 0.5 * float((high - low).norm()) / narrow
+    return cameras_around((0.5 * (low + high)).tolist(), distance, up, fov, width, height)
+
+
+def cameras_around(
+    center: Sequence[float] | Tensor,
+    distance: float,
+    up: Sequence[float] | Tensor,
+    fov_y_degrees: float,
+    width: int,
+    height: int,
+    count: int = 12,
+    elevations: Sequence[float] = (0.0, 30.0),
+) -> list[Camera]:
+    """Cameras around an object from which a registration may start.
+
+    Args:
+        center: Of the object [scene units], shape (3,).
+        distance: From there [scene units].
+        up: Direction that is up, shape (3,).
+        fov_y_degrees: Vertical field of view [degrees].
+        width: Of the frame [pixels].
+        height: Of the frame [pixels].
+        count: Directions around the object.
+        elevations: Angles above the level [degrees].
+    """
+    check_whole("count", count, 1)
+    middle = torch.as_tensor(center, dtype=torch.float64)
+    axis = torch.nn.functional.normalize(torch.as_tensor(up, dtype=torch.float64), dim=0)
+    across = torch.eye(3, dtype=torch.float64)[int(axis.abs().argmin())]
+    first = torch.nn.functional.normalize(torch.linalg.cross(axis, across), dim=0)
+    second = torch.linalg.cross(axis, first)
+    found = []
+    for elevation in map(math.radians, elevations):
+        for turn in (2 * math.pi * k / count for k in range(count)):
+            level = math.cos(turn) * first + math.sin(turn) * second
+            eye = middle + distance * (math.cos(elevation) * level + math.sin(elevation) * axis)
+            found.append(look_at_camera(eye, middle, axis, fov_y_degrees, width, height, dtype=torch.float64))
+    return found
+
+
+def fov_of(camera: Camera) -> float:
+    """Vertical field of view [degrees]."""
+    return 2 * math.degrees(math.atan(0.5 * camera.height / float(camera.intrinsics[1, 1])))
+
+
+def transforms(camera: Camera, film: str, origin: Origin) -> dict[str, Any]:
+    """The content of a transforms.json with one film, or one picture, at time 0; ``origin`` is that of the splat."""
+    pose = torch.linalg.inv(camera.world_to_camera.double()) @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]).double())
+    pose[:3, 3] += torch.tensor(origin, dtype=torch.float64)
+    K = camera.intrinsics.double()
+    kind = "file_path" if Path(film).suffix.lower() in STILLS else "video_path"
+    return {
+        "fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2]),
+        "w": camera.width, "h": camera.height,
+        "frames": [{kind: Path(film).as_posix(), "transform_matrix": pose.tolist(), "time": 0.0}],
+    }  # fmt: skip
+
+
+def find_camera(draw: Draw, frame: Tensor, start: Sequence[Camera], *, focal: bool = False) -> Registration:
+    """Find the camera of a frame of something that stands still.
+
+    Args:
+        draw: Draws the splat, at rest.
+        frame: The frame, dtype uint8, shape (H, W, 3), without lens distortion.
+        start: Cameras to begin with, of the frame's size and with its intrinsics; the one with the most matches that
+            agree is taken. One is enough if it is within some 20 degrees.
+        focal: Whether the focal length is to be found, too. It needs depth in what is seen, or a slanted surface.
+
+    Raises:
+        ImportError: Without OpenCV.
+        ValueError: If the frame and the cameras do not fit, or the splat is not found in the frame.
+    """
+    cv2 = opencv()
+    height, width = frame.shape[:2]
+    if not start or any((camera.width, camera.height) != (width, height) for camera in start):
+        raise ValueError(f"Expected `start` to be cameras of the frame's size, {width} x {height}.")
+    grey = grey_of(frame)
+    sift = cv2.SIFT_create(nfeatures=4000, contrastThreshold=0.02)
+    wanted = sift.detectAndCompute(grey, None)
+    tried = [_by_features(cv2, sift, wanted, draw(camera), camera, focal=False) for camera in start]
+    best = max((one for one in tried if one is not None), key=lambda one: one.agreeing, default=None)
+    if best is None:
+        raise ValueError(
+            "The splat was not found in the frame: give a camera that is nearer, a frame that shows more of it, or one "
+            "with more texture."
+        )
+    for _ in range(ROUNDS):
+        best = _by_features(cv2, sift, wanted, draw(best.camera), best.camera, focal) or best
+    for _ in range(ROUNDS if best.agreeing < ENOUGH else 0):
+        best = _by_flow(grey, draw(best.camera), best.camera, focal) or best
+    return best
+
+
+def refine(frame: Tensor, picture: RenderOutput, camera: Camera, where: Tensor) -> Registration | None:
+    """The camera of a frame, from points that are followed there from a picture taken nearby.
+
+    Args:
+        frame: The frame, dtype uint8, shape (H, W, 3).
+        picture: The splat, drawn from ``camera``.
+        camera: A camera so near that most points move by less than some 20 pixels.
+        where: The pixels of the picture that count, bool, shape (H, W).
+
+    Returns:
+        None if too few points agree.
+    """
+    return _by_flow(grey_of(frame), picture, camera, False, _near(camera), where)
+
+
+def _near(camera: Camera) -> float:
+    return NEAR * math.hypot(camera.width, camera.height)
+
+
+def grey_of(image: Tensor) -> Any:
+    """An image of bytes or of colours in [0, 1], (H, W, 3), as grey bytes whose contrast is the same everywhere."""
+    whole = image.float() if image.dtype == torch.uint8 else image.detach().float().cpu().clamp(0, 1) * 255
+    grey = whole @ torch.tensor([0.299, 0.587, 0.114])
+    equal = opencv().createCLAHE(clipLimit=3.0, tileGridSize=(8, 8))  # takes what another light changes
+    return equal.apply(grey.round().to(torch.uint8).numpy())
+
+
+def in_space(picture: RenderOutput, camera: Camera, pixel: Any) -> tuple[Any, Any]:
+    """Places on the surface that pixels (N, 2) of a picture show, float64, and a mask of those whose depth is known."""
+    import numpy as np
+
+    alpha = picture.alpha[..., 0].detach().cpu().numpy()
+    depth = (picture.depth / picture.alpha.clamp(min=1e-3))[..., 0].detach().cpu().numpy().astype(np.float64)
+    height, width = alpha.shape
+    x, y = pixel[:, 0] - 0.5, pixel[:, 1] - 0.5
+    column, row = np.clip(np.floor(x).astype(int), 0, width - 2), np.clip(np.floor(y).astype(int), 0, height - 2)
+    corners = [(row + i, column + j) for i in (0, 1) for j in (0, 1)]
+    known = np.min([alpha[corner] for corner in corners], 0) > SOLID
+    fx, fy = x - column, y - row
+    shares = ((1 - fy) * (1 - fx), (1 - fy) * fx, fy * (1 - fx), fy * fx)
+    z = sum(share * depth[corner] for share, corner in zip(shares, corners, strict=True))
+    K = camera.intrinsics.double().cpu().numpy()
+    local = np.stack([(pixel[:, 0] - K[0, 2]) / K[0, 0] * z, (pixel[:, 1] - K[1, 2]) / K[1, 1] * z, z], 1)
+    view = camera.world_to_camera.double().cpu().numpy()
+    return (local - view[:3, 3]) @ view[:3, :3], known
+
+
+def off_camera(world: Any, there: Any, intrinsics: Any, near: float) -> Any:
+    """Distances of points in a frame from where the camera sees them that agrees with most of them [pixels].
+
+    Args:
+        world: Their places in space, shape (T, 3).
+        there: Where they are in the frame [pixels], shape (T, 2).
+        intrinsics: Of the camera, shape (3, 3).
+        near: Largest distance of points that agree [pixels].
+
+    Returns:
+        Shape (T,); None if less than half of them agree on a camera.
+    """
+    import numpy as np
+
+    cv2 = opencv()
+    if len(world) < 8:
+        return None
+    done, turn, shift, agree = cv2.solvePnPRansac(
+        world, there, intrinsics, None, reprojectionError=near, flags=cv2.SOLVEPNP_AP3P
+    )
+    if not done or len(agree) < 0.5 * len(world):
+        return None
+    agree = agree[:, 0]
+    turn, shift = cv2.solvePnPRefineLM(world[agree], there[agree], intrinsics, None, turn, shift)
+    return np.linalg.norm(cv2.projectPoints(world, turn, shift, intrinsics, None)[0].reshape(-1, 2) - there, axis=-1)
+
+
+def _by_features(
+    cv2: Any, sift: Any, wanted: tuple[Any, Any], picture: RenderOutput, camera: Camera, focal: bool
+) -> Registration | None:
+    """The camera from matched features; None if too few agree."""
+    import numpy as np
+
+    mask = (picture.alpha[..., 0].detach().cpu().numpy() > SOLID).astype(np.uint8)
+    points, codes = sift.detectAndCompute(grey_of(picture.color), mask)
+    if codes is None or wanted[1] is None or len(points) < LEAST or len(wanted[0]) < LEAST:
+        return None
+    pairs = cv2.BFMatcher().knnMatch(codes, wanted[1], k=2)
+    good = [pair[0] for pair in pairs if len(pair) == 2 and pair[0].distance < RATIO * pair[1].distance]
+    if len(good) < LEAST:
+        return None
+    here = np.array([points[one.queryIdx].pt for one in good]) + 0.5  # OpenCV counts from the centre of a pixel
+    there = np.array([wanted[0][one.trainIdx].pt for one in good]) + 0.5
+    return _seen_from(cv2, picture, camera, here, there, focal, _near(camera))
+
+
+def _by_flow(
+    grey: Any,
+    picture: RenderOutput,
+    camera: Camera,
+    focal: bool,
+    near: float = CLOSE,
+    where: Tensor | None = None,
+) -> Registration | None:
+    """The camera from points that are followed from the picture to the frame; None if too few are."""
+    import numpy as np
+
+    cv2, drawn = opencv(), grey_of(picture.color)
+    solid = picture.alpha[..., 0].detach().cpu().numpy() > SOLID
+    solid = solid if where is None else solid & where.numpy()
+    mask = cv2.erode(solid.astype(np.uint8), np.ones((5, 5), np.uint8))
+    corners = cv2.goodFeaturesToTrack(drawn, 1000, 0.005, 3, mask=mask)
+    if corners is None or len(corners) < LEAST:
+        return None
+    here = corners.reshape(-1, 2).astype(np.float64) + 0.5
+    (_, place), (_, seen) = follow(np.stack([drawn, grey])[..., None].repeat(3, -1), here)
+    return _seen_from(cv2, picture, camera, here[seen], place[seen], focal, near)
+
+
+def _seen_from(
+    cv2: Any, picture: RenderOutput, camera: Camera, here: Any, there: Any, focal: bool, near: float
+) -> Registration | None:
+    """The camera that sees what the picture shows at ``here`` at ``there``; None if too few pairs agree."""
+    import numpy as np
+
+    world, known = in_space(picture, camera, here)
+    world, there = world[known], np.ascontiguousarray(there[known], dtype=np.float64)
+    if len(world) < LEAST:
+        return None
+    K = camera.intrinsics.double().cpu().numpy().copy()
+    done, turn, shift, _ = cv2.solvePnPRansac(
+        world, there, K, None, iterationsCount=2000, reprojectionError=near, confidence=0.9999, flags=cv2.SOLVEPNP_AP3P
+    )
+    view = camera.world_to_camera.double().cpu().numpy()
+    begun = cv2.solvePnPRefineLM(world, there, K, None, cv2.Rodrigues(view[:3, :3])[0], view[:3, 3:].copy())
+    found = [_agreeing(cv2, world, there, K, near, *pair) for pair in [begun] + [(turn, shift)] * done]
+    index, turn, shift = max(found, key=lambda one: len(one[0]))
+    if len(index) < LEAST:
+        return None
+    world, there = world[index], there[index]
+    if focal:
+        flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO
+        flags |= cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
+        size = (camera.width, camera.height)
+        given = ([world.astype(np.float32)], [there.astype(np.float32)], size, K, None)
+        _, K, _, (turn,), (shift,) = cv2.calibrateCamera(*given, flags=flags)
+    off = cv2.projectPoints(world, turn, shift, K, None)[0].reshape(-1, 2) - there
+    view = np.eye(4)
+    view[:3, :3], view[:3, 3] = cv2.Rodrigues(turn)[0], shift.reshape(3)
+    seen = replace(camera, world_to_camera=torch.from_numpy(view), intrinsics=torch.from_numpy(np.asarray(K, float)))
+    residual = float(np.sqrt((off**2).sum(1).mean()))
+    slope = _slope(torch.from_numpy(world), seen)
+    apart = len(set(map(tuple, (there // window_of(camera.width, camera.height)).astype(int).tolist())))
+    variance = 0.5 * residual**2 * len(world) / apart
+    spread = variance * torch.linalg.pinv(slope.T @ slope, hermitian=True)
+    return Registration(seen, int(known.sum()), len(index), residual, spread)
+
+
+def _agreeing(cv2: Any, world: Any, there: Any, K: Any, near: float, turn: Any, shift: Any) -> tuple[Any, Any, Any]:
+    import numpy as np
+
+    index: Any = np.arange(0)
+    for _ in range(REFINED):
+        off = cv2.projectPoints(world, turn, shift, K, None)[0].reshape(-1, 2) - there
+        index = np.flatnonzero(np.linalg.norm(off, axis=1) < near)
+        if len(index) < LEAST:
+            break
+        turn, shift = cv2.solvePnPRefineLM(world[index], there[index], K, None, turn, shift)
+    return index, turn, shift
+
+
+def _slope(places: Tensor, camera: Camera) -> Tensor:
+    """Derivatives of the pixels of places (N, 3) by a small rotation of the camera's axes and a shift, (2N, 6)."""
+    view, K = camera.world_to_camera, camera.intrinsics
+    local = places @ view[:3, :3].T + view[:3, 3]
+    x, y, z = local.unbind(1)
+    zero = torch.zeros_like(z)
+    by_place = torch.stack([K[0, 0] / z, zero, -K[0, 0] * x / z**2, zero, K[1, 1] / z, -K[1, 1] * y / z**2], 1)
+    by_place = by_place.unflatten(1, (2, 3))
+    by_turn = torch.linalg.cross(local[:, None].expand_as(by_place), by_place)
+    return torch.cat([by_turn, by_place], 2).flatten(0, 1)
