@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import torch
 
 from gaussian_swaying.geometry.linalg_triton import add3, axpy3, dot3
@@ -28,12 +31,19 @@ def pull_force(F, velocity, position, point, numbers, now, table, OPTIONS):
     return axpy3(point[3] * pull, away, -damping, velocity), damping
 
 
+def pull(per_point: Callable[[], torch.Tensor], place: Callable[..., torch.Tensor], **further: Any) -> DeviceFunction:
+    """A pull of points towards a place that may move.
+
+    Args:
+        per_point: Returns where each point belongs from the place [m], and the mass that is held, shape (..., P, 4).
+        place: Returns the place [m] at the start of substeps, by time, substep and their number, shape (steps, 3).
+        further: Further fields of the :class:`DeviceFunction`.
+    """
+    own, now = Numbers(4, per_point), Numbers(3, place)
+    options = (QUICK, STRONGEST)
+    return DeviceFunction(pull_force, options, per_point=own, per_substep=now, implicit=True, **further)
+
+
 def still_pull(points: torch.Size) -> DeviceFunction:
     """A pull that holds nothing yet; ``points`` is the shape of a field of one number for each point."""
-    return DeviceFunction(
-        pull_force,
-        options=(QUICK, STRONGEST),
-        per_point=Numbers(4, lambda: torch.zeros(*points, 4)),
-        per_substep=Numbers(3, lambda time, dt, steps: torch.zeros(steps, 3)),
-        implicit=True,
-    )
+    return pull(lambda: torch.zeros(*points, 4), lambda time, dt, steps: torch.zeros(steps, 3))

@@ -23,7 +23,9 @@ from gaussian_swaying._inputs import spare_memory
 from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.mpm.device_functions import DeviceFunction
 from gaussian_swaying.mpm.forces import Force
+from gaussian_swaying.mpm.pull import pull
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.rendering.gsplat_renderer import make_renderer
 from gaussian_swaying.rendering.thinning import DETAIL
@@ -117,8 +119,6 @@ def take(simulation: Simulation, parser: ArgumentParser, settings: Namespace, va
 
 
 REACH = 0.06  # radius of what is grabbed, as a share of the longest side
-QUICK = 40.0  # 1/s: how quickly what is grabbed follows, if nothing else acts on it
-STRONGEST = 400.0  # m/s²: largest acceleration of what is grabbed
 
 
 class Pull(Force):
@@ -168,14 +168,13 @@ class Pull(Force):
         target = self._frame.point_to_sim(torch.tensor(list(place), dtype=torch.float64))
         self.target.copy_(target.to(self.target))
 
-    def forward(self, state: State) -> tuple[Tensor, Tensor]:
-        """Force [N], shape (P, 3), and resistance [kg/s], shape (P,)."""
-        away = self.target + self.offset - state.position
-        pull = QUICK**2 * away
-        size = torch.linalg.vector_norm(pull, dim=-1, keepdim=True)
-        pull = pull * (STRONGEST / size.clamp(min=STRONGEST))
-        damping = 2 * QUICK * self.held
-        return self.held[:, None] * pull - damping[:, None] * state.velocity, damping
+    def device_function(self) -> DeviceFunction:
+        """The pull of the package's kernels."""
+        return pull(
+            lambda: torch.cat([self.offset, self.held[:, None]], -1),
+            lambda time, dt, steps: self.target.expand(steps, 3),
+            sources=(self.offset, self.held),
+        )
 
 
 SLOW, FAST = 0.09, 0.025  # s: steps that take longer are halved, and shorter ones doubled again

@@ -61,8 +61,8 @@ def test_a_sweep_on_all_gpus(tmp_path, sweep_file):
     file, folder = sweep_file(tmp_path / "tiny.yaml", settings=settings), tmp_path / "out"
     assert main([str(file), "--output", str(folder), "--together", "4", "--device", "cuda"]) == 0
     assert {row["status"] for row in rows(folder / "sweep.csv")} == {"complete"}
-    for file in (folder / "results").iterdir():
-        assert json.loads(file.read_text())["peak_memory_bytes"]["device"] > 0
+    for result in (folder / "results").iterdir():
+        assert json.loads(result.read_text())["peak_memory_bytes"]["device"] > 0
     again = tmp_path / "again"
     assert main([str(file), "--output", str(again), "--together", "4", "--device", "cuda", "--per-gpu", "2"]) == 0
     assert (again / "sweep.csv").read_bytes() == (folder / "sweep.csv").read_bytes()

@@ -26,7 +26,7 @@ export async function sway(read, tell) {
   const state = { failed: null, rate: null, message: "", solver: "", why: null };
   const say = (/** @type {any} */ message, /** @type {Transferable[]} */ given = []) => worker.postMessage(message, given);
   const answers = []; // promises of tests, see `advance`
-  const wish = new URLSearchParams(location.hash.slice(1)).get("solver") ?? "auto"; // webgpu or worker
+  let wish = ""; // webgpu, worker or auto: where the link wants it to be computed
 
   const start = new Promise((resolve, reject) => {
     const first = (/** @type {MessageEvent} */ event) => {
@@ -46,7 +46,13 @@ export async function sway(read, tell) {
     else say({ kind: "wind", flow: tunnel.changed.get("wind") ?? null, gusts: value("gusts") });
   });
   tunnel.metre = head.metre;
-  const { setPlaying, reset } = tunnel;
+  const { setPlaying, reset, apply } = tunnel;
+  tunnel.apply = (text, whole) => {
+    apply.call(tunnel, text, whole);
+    const found = new URLSearchParams(text.replace(/^[#?]/, "")).get("solver") ?? "auto";
+    if (found !== "auto") tunnel.changed.set("solver", found);
+    if (found !== wish) say({ kind: "solver", which: (wish = found) });
+  };
   tunnel.setPlaying = (on) => (on && state.failed ? null : setPlaying.call(tunnel, on));
   tunnel.reset = () => {
     reset.call(tunnel);
@@ -91,7 +97,6 @@ export async function sway(read, tell) {
   const complete = view.takeRest();
   const begin = () => {
     tunnel.apply(location.hash);
-    say({ kind: "solver", which: wish });
     tunnel.run();
     explain();
   };
