@@ -248,6 +248,7 @@ class Server:
         self.clients: list[Client] = []
         self._progress: dict[str, Any] | None = {"share": 0.0, "what": "Loading the scene"}
         self._notice = ("", 0.0)
+        self._first: tuple[Any, dict[str, Any]] = (None, {})  # the first view of a simulation
         self._state: tuple[Any, bytes] = (None, b"")  # the message of the newest state
         self._film: tuple[Any, Film, bytes] | None = None  # the scene that browsers draw, and what it is that of
         self._upload: tempfile.TemporaryDirectory[str] | None = None  # where the splat lies that was loaded
@@ -255,7 +256,7 @@ class Server:
         self._recording: FilmStrip | None = None
         self._recorder: Client | None = None  # from whose camera it is recorded
         self._video = b""
-        self._texts: tuple[float, dict[str, Any]] = (-1.0, {})
+        self._texts: tuple[float, Any, dict[str, Any]] = (-1.0, None, {})  # when, the settings, and what was told
         self._work, self._draw = ThreadPoolExecutor(1, "work"), ThreadPoolExecutor(1, "draw")
         self._closing = threading.Event()
         self._loop = asyncio.new_event_loop()
@@ -623,8 +624,9 @@ class Server:
     def _news(self) -> dict[str, Any]:
         """Controls and figures, the same for all browsers."""
         now = time.monotonic()
-        if now - self._texts[0] < TOLD_EVERY and self._texts[1]:
-            return self._texts[1]
+        settings = None if self.session is None else self.session.settings
+        if now - self._texts[0] < TOLD_EVERY and settings is self._texts[1]:
+            return self._texts[2]
         notice = self._notice[0] if now < self._notice[1] else ""
         figures: dict[str, Any] = {"loading": self._progress, "notice": notice}
         found: dict[str, Any] = {"figures": figures}
@@ -634,7 +636,10 @@ class Server:
                 rates, health = session.rates(), session.snapshot.health
                 elsewhere = self.door.token is not None
                 found["panel"] = {"groups": self.panel.groups(), "legends": self.panel.legends()}
-                found["panel"] |= {"together": list(TOGETHER), "elsewhere": elsewhere, **first_view(session.simulation)}
+                found["panel"] |= {"together": list(TOGETHER), "elsewhere": elsewhere}
+                if self._first[0] is not session.simulation:  # which waits for the step that is under way
+                    self._first = session.simulation, first_view(session.simulation)
+                found["panel"] |= self._first[1]
                 found["painting"] = self.painting.shown()
                 figures |= {"paused": session.paused, "speed": session.speed, "broken": session.broken}
                 figures |= {"problem": session.problem, "undo": session.changes, "rate": rates.real_time}
@@ -642,7 +647,7 @@ class Server:
                 figures |= {"time": health.time, "substeps": rates.substeps, "step": rates.step}
                 figures |= {"stretch": [health.stretch_min, health.stretch_max], "held": session.pulls}
                 figures["recorded"] = None if self._recording is None else self._recording.seconds
-        self._texts = (now, found)
+        self._texts = (now, settings, found)
         return found
 
     async def _send(self, client: Client, session: Session) -> None:
