@@ -27,7 +27,7 @@ export async function play(read, tell) {
 
   function show(frame) {
     if (frame === state.frame) return;
-    drawing.move((data) => frames.write(data, frame));
+    view.move((data) => frames.write(data, frame));
     state.frame = frame;
     slider.value = String(frame);
     const seconds = (count) => (count * head.frame_dt).toFixed(2);

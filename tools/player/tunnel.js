@@ -233,7 +233,7 @@ export class Tunnel {
     playback.advance(now / 1000);
     if (playback.newest !== null && (this.stale || playback.shown !== before)) {
       this.stale = false;
-      view.drawing.move((data) => playback.write(data));
+      view.move((data) => playback.write(data));
     }
     const { camera, controls } = view;
     this.panel.face(Math.atan2(camera.position.y - controls.target.y, camera.position.x - controls.target.x) + Math.PI / 2);

@@ -7,6 +7,7 @@ const COARSE = 1 / 4; // of the window's pixels along each side, until all Gauss
 const PIXELS = [1, 0.75, 0.5, 0.35]; // the same, where drawing is slow
 const FEW = 20; // pictures a second
 const WINDOW = 1500; // ms, over which they are counted
+const CALM = 300; // ms without motion, after which the picture is sharp
 
 // How far the moving Gaussians reach to the left and right of the first view, as a tangent.
 function reach(camera, layer) {
@@ -38,7 +39,12 @@ export class View {
     this.camera.up.set(0, 0, 1);
     this.controls = new OrbitControls(this.camera, canvas);
     Object.assign(this.controls, { enableDamping: true, minDistance: 0.1, maxDistance: 20 });
-    this.controls.addEventListener("change", () => this.wake(3));
+    this.controls.addEventListener("change", () => {
+      this.stirred = performance.now();
+      this.wake(3);
+    });
+    this.stirred = 0; // when the view or the scene moved last [ms]
+    this.sharp = false;
     this.lately = { since: 0, pictures: 0, size: 0 };
     addEventListener("resize", () => this.resize());
   }
@@ -84,7 +90,7 @@ export class View {
     const [width, height] = [window.innerWidth, window.innerHeight];
     if (drawing) {
       drawing.rough(!whole);
-      drawing.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2) * (whole ? PIXELS[this.lately.size] : COARSE));
+      drawing.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2) * (!whole ? COARSE : this.sharp ? 1 : PIXELS[this.lately.size]));
       drawing.renderer.setSize(width, height);
     }
     const upright = Math.tan((aimed.fov * Math.PI) / 360);
@@ -93,6 +99,12 @@ export class View {
     camera.fov = (2 * Math.atan(Math.max(across / camera.aspect, upright)) * 180) / Math.PI;
     camera.updateProjectionMatrix();
     this.wake(3);
+  }
+
+  // Move the nodes, as Drawing does.
+  move(fill) {
+    this.stirred = performance.now();
+    this.drawing.move(fill);
   }
 
   // Draw from now on; `tick(now)` is called before each picture.
@@ -116,9 +128,14 @@ export class View {
     requestAnimationFrame(loop);
   }
 
-  // Fewer pixels where drawing is slow.
+  // Fewer pixels where drawing is slow, while something moves.
   adapt(now) {
     const { lately } = this;
+    const sharp = now - this.stirred > CALM;
+    if (sharp !== this.sharp) {
+      this.sharp = sharp;
+      if (lately.size > 0) this.resize();
+    }
     if (this.left === 0) Object.assign(lately, { since: now, pictures: 0 }); // nothing to draw says nothing
     if (now - lately.since < WINDOW) return;
     this.rate = (1000 * lately.pictures) / (now - lately.since);
