@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import gzip
 import hmac
+import io
 import json
 import logging
 import secrets
@@ -23,6 +24,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import torch
 from aiohttp import WSMsgType, web
+from PIL import Image
 from torch import Tensor
 
 from gaussian_swaying._checks import one_line
@@ -50,6 +52,7 @@ MOST_PER_SECOND = 30  # pictures or states for a browser
 TOLD_EVERY = 0.2  # s between two figures
 AHEAD = 2  # states or pictures that a browser may have before it confirms the first
 RECENT = 2.0  # s
+SOON = 0.2  # s that a browser waits for a scene before it gets a picture
 MOST_SAID, MOST_LOADED = 1 << 20, 1 << 31  # bytes of a message, and of a file, of a browser
 JPEG_QUALITY = 75
 
@@ -251,6 +254,7 @@ class Server:
         self._first: tuple[Any, dict[str, Any]] = (None, {})  # the first view of a simulation
         self._state: tuple[Any, bytes] = (None, b"")  # the message of the newest state
         self._film: tuple[Any, Film, bytes] | None = None  # the scene that browsers draw, and what it is that of
+        self._making: asyncio.Future[Any] | None = None  # another one, for all browsers
         self._upload: tempfile.TemporaryDirectory[str] | None = None  # where the splat lies that was loaded
         self._loading = False
         self._recording: FilmStrip | None = None
@@ -302,7 +306,6 @@ class Server:
 
     def close(self) -> None:
         self._closing.set()
-        self._loop.call_soon_threadsafe(lambda: None)
         self._thread.join(10.0)
         self._work.shutdown()
         self._draw.shutdown()
@@ -659,7 +662,18 @@ class Server:
             return
         key = (snapshot.simulation, snapshot.simulation.scene)
         if self._film is None or self._film[0] != key:
-            self._film = await self._loop.run_in_executor(None, self._make_film, key, snapshot)
+            if self._making is None:
+                self._making = self._loop.run_in_executor(None, self._make_film, key, snapshot)
+            making = self._making
+            await asyncio.wait([making], timeout=SOON)
+            if not making.done():  # millions of Gaussians take seconds
+                await self._send_picture(client, session, snapshot, still)
+                return
+            if self._making is making:
+                self._making = None
+                self._film = making.result()
+            if self._film is None or self._film[0] != key:
+                return
         film = self._film[1]
         painter, roles = snapshot.simulation.painter, self.painting.roles
         look = (painter.shader, painter.background)
@@ -702,10 +716,6 @@ class Server:
             await self._record(client)
 
     def _picture(self, client: Client, eye: Eye, session: Session, snapshot: Snapshot, still: bool) -> bytes:
-        import io
-
-        from PIL import Image
-
         width, height = client.size.fit(*eye.size, still)
         camera = eye.camera(snapshot.simulation.scene, width, height)
         with session.lock:

@@ -415,11 +415,6 @@ class WindField(Fixed, nn.Module):
         """The same wind with another steady flow [m/s], in place of a schedule, too; a tensor keeps its gradient."""
         return changed(self, flows=flow_rows("flow", [flow]), times=self.times.new_zeros(1))
 
-    def with_schedule(self, times: Sequence[float], flows: Sequence[VectorLike]) -> WindField:
-        """The same wind with other flows [m/s] at some times [s], ascending, and linear between them."""
-        rows = flow_rows("flow", flows)
-        return changed(self, flows=rows, times=self.times.new_tensor(times), interpolation="linear")
-
     def _keys(self, time: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The entries of the schedule before and after times (...), and the time since the former [s]."""
         last = self.times.numel() - 1

@@ -300,6 +300,7 @@ def test_a_link_sets_what_it_says(page, browser):
     until(lambda: page.session.settings.wind.flow == [0.0, 3.0, 0.0] and page.session.speed == 0.5)
     until(lambda: page.session.settings.material.E == 2e4)
     assert window.evaluate("wind.view.camera.position.y") == pytest.approx(-3.0, abs=1e-6)
+    assert "#wind.flow=0,3,0&material.E=20000&speed=0.5&view=" in window.evaluate("wind.tunnel.link()")
     assert window.problems == []
     context.close()
 

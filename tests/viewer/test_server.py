@@ -236,6 +236,30 @@ def test_a_browser_that_draws_gets_no_pictures(page, connect):
         assert client.get()["kind"] != "picture"
 
 
+def test_pictures_come_while_a_scene_is_made_once_for_all(page, connect, monkeypatch):
+    """As of millions of Gaussians; and a scene that cannot be made is said on the page."""
+    made, begun = threading.Event(), []
+
+    def slow(*given):
+        begun.append(given)
+        assert made.wait(60)
+        if len(begun) == 1:
+            raise ValueError("no memory")
+        return film_without_frames(*given)
+
+    monkeypatch.setattr(server_module, "film_without_frames", slow)
+    client, other = connect(page), connect(page)
+    for each in (client, other, client):
+        each.wait("picture")
+    assert len(begun) == 1
+    made.set()
+    client.wait("figures", notice="A picture could not be drawn: no memory")
+    for each in (client, other):
+        each.wait("scene")
+        each.wait("state")
+    assert len(begun) == 2
+
+
 def test_who_looks_away_gets_nothing_to_draw(page, connect):
     client = connect(page)
     client.wait("state")

@@ -194,7 +194,6 @@ class Live {
     if (this.hash !== undefined) return;
     this.hash = location.hash; // once the controls are there
     this.tunnel.apply(this.hash);
-    this.tunnel.changed.clear();
   }
 
   showLegend() {
