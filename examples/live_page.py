@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from gaussian_swaying import Box, Material, MPMSolver, OrbitCamera, PinnedRegion, Simulation
+from gaussian_swaying.player.live_web.page import write_live_web
 from gaussian_swaying.scenes import FlagScene
-from gaussian_swaying.viewer.live_web.page import write_live_web
 
 
 def main(target: Path, spacing: float = 0.03) -> int:

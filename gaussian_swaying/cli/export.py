@@ -25,8 +25,8 @@ from gaussian_swaying.gaussians.formats import (
 )
 from gaussian_swaying.gaussians.spz import VERSIONS
 from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.player.film.page import write_film, write_player
 from gaussian_swaying.simulation.simulation import RecordedRun
-from gaussian_swaying.viewer.film.page import write_film, write_player
 
 
 def build_options() -> argparse.ArgumentParser:

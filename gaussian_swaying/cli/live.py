@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 from gaussian_swaying import _program as program
 from gaussian_swaying.cli.errors import run_command
 from gaussian_swaying.cli.scene import is_given, settings_of, words_of
+from gaussian_swaying.player.server import Server
+from gaussian_swaying.player.session import Session, in_real_time, share_cores
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.viewer.server import Server
-from gaussian_swaying.viewer.session import Session, in_real_time, share_cores
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace

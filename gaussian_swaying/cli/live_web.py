@@ -11,9 +11,9 @@ from gaussian_swaying import _program as program
 from gaussian_swaying._files import check_page
 from gaussian_swaying.cli.scene import settings_of, words_of
 from gaussian_swaying.config.parser import scene_name
+from gaussian_swaying.player.live_web.budget import TARGETS, fitted
+from gaussian_swaying.player.live_web.page import write_live_web
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.viewer.live_web.budget import TARGETS, fitted
-from gaussian_swaying.viewer.live_web.page import write_live_web
 
 
 def build_options() -> argparse.ArgumentParser:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from gaussian_swaying.cli.errors import guessing
 from gaussian_swaying.cli.shipped import names, with_shipped
+from gaussian_swaying.player.session import settings_of_splat
 from gaussian_swaying.simulation.model import resolve_device
-from gaussian_swaying.viewer.session import settings_of_splat
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace

@@ -17,10 +17,10 @@ from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.gaussians.formats import export_cloud
 from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.player.session import settings_of_splat
 from gaussian_swaying.scenes import FlagScene
 from gaussian_swaying.scenes.alocasia import alocasia
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.viewer.session import settings_of_splat
 
 
 def test_options_and_scene_come_in_any_order(parser):
@@ -118,7 +118,7 @@ def test_the_grid_is_chosen_for_real_time_unless_it_is_given(capsys, monkeypatch
     before = file.read_bytes()
     monkeypatch.setattr(live, "Server", FakePage)
     monkeypatch.setattr(live, "share_cores", lambda: None)
-    monkeypatch.setattr("gaussian_swaying.viewer.session.estimate_cost", cubed)
+    monkeypatch.setattr("gaussian_swaying.player.session.estimate_cost", cubed)
     assert live.main([str(file), "--no-browser", *options]) == 0
     session = FakePage.shown
     told = capsys.readouterr().out

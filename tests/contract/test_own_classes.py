@@ -23,10 +23,10 @@ from gaussian_swaying.gaussians.formats import FORMATS
 from gaussian_swaying.inverse.plan import read_plan
 from gaussian_swaying.inverse.unknowns import check_unknowns
 from gaussian_swaying.inverse.variants import states_of
+from gaussian_swaying.player.panel import Panel
+from gaussian_swaying.player.session import Session
 from gaussian_swaying.rendering.passes import PASSES
 from gaussian_swaying.scenes import FlagScene
-from gaussian_swaying.viewer.panel import Panel
-from gaussian_swaying.viewer.session import Session
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/extending.md").read_text()

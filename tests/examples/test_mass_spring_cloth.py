@@ -14,9 +14,9 @@ from gaussian_swaying.cli.evaluate import main as evaluate
 from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.geometry.regions import Sphere
 from gaussian_swaying.mpm.embedded import EmbeddedAtPoints
+from gaussian_swaying.player.session import Session
 from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.simulation.model import Edit
-from gaussian_swaying.viewer.session import Session
 
 BOX = {"min": [None, None, None], "max": [0.11, None, None]}
 FILE = Path(__file__).parents[2] / "examples" / "mass_spring_cloth.py"

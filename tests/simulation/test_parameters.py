@@ -16,6 +16,7 @@ from gaussian_swaying.inverse.unknowns import Unknown, check_unknowns
 from gaussian_swaying.inverse.variants import states_of
 from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
+from gaussian_swaying.player.session import Session, changed_settings
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.scenes.solid import SolidScene
 from gaussian_swaying.simulation.body import Material, Scene
@@ -23,7 +24,6 @@ from gaussian_swaying.simulation.model import Copy, Edit, in_settings, names, nu
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep
 from gaussian_swaying.sweeps.run import grouped
-from gaussian_swaying.viewer.session import Session, changed_settings
 from gaussian_swaying.wind.force import AeroForce
 
 CONFIG = base(frames=3)

@@ -38,7 +38,7 @@ async function banner(sources) {
 
 await build({
   entryPoints: ["main.js"],
-  outfile: "../../gaussian_swaying/viewer/film/page/film.min.js",
+  outfile: "../../gaussian_swaying/player/film/page/film.min.js",
   bundle: true,
   minify: true,
   format: "iife",
@@ -51,7 +51,7 @@ await build({
 // sway.js, with three.js and Spark as its user has them.
 await build({
   entryPoints: ["sway.js"],
-  outfile: "../../gaussian_swaying/viewer/film/page/sway.min.js",
+  outfile: "../../gaussian_swaying/player/film/page/sway.min.js",
   bundle: true,
   minify: true,
   format: "esm",
@@ -62,7 +62,7 @@ await build({
 
 await build({
   entryPoints: ["live_web/worker.js"],
-  outfile: "../../gaussian_swaying/viewer/live_web/page/worker.min.js",
+  outfile: "../../gaussian_swaying/player/live_web/page/worker.min.js",
   target: "es2022",
   bundle: true,
   minify: true,

@@ -1,4 +1,4 @@
-// The frames of a film, and the blocks of a .sway file; see docs/bundle.md and gaussian_swaying/viewer/film/page.py.
+// The frames of a film, and the blocks of a .sway file; see docs/bundle.md and gaussian_swaying/player/film/page.py.
 import { reader, writeNodes } from "./gaussians.js";
 
 // The few nodes of each frame that swing far: index and displacement.

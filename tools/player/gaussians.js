@@ -6,7 +6,7 @@ import { makeSorter } from "./sorter.js";
 
 const WIDTH = 2048; // of the textures with a texel for each Gaussian or node
 
-// ---- the parts of the file, see gaussian_swaying/viewer/film/page.py
+// ---- the parts of the file, see gaussian_swaying/player/film/page.py
 
 export function reader(bytes) {
   let at = 0;

@@ -10,7 +10,7 @@ const SLOW = 3; // pictures a second; a browser that draws fewer gets pictures f
 const PATIENCE = 4000; // ms, until that is decided
 const AGAIN = 1000; // ms until a connection that broke is opened again
 
-// ---- messages, see gaussian_swaying/viewer/server.py
+// ---- messages, see gaussian_swaying/player/server.py
 
 function unpack(data) {
   const bytes = new Uint8Array(data);

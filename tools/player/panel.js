@@ -1,4 +1,4 @@
-// The controls of a page, made from descriptions: name, label, kind, ends, unit and value of each. See gaussian_swaying/viewer/panel.py.
+// The controls of a page, made from descriptions: name, label, kind, ends, unit and value of each. See gaussian_swaying/player/panel.py.
 const HOLD = 800; // ms in which a control that was just used keeps its value, whatever the server says
 const STEPS = 200; // of a slider
 const STEP = 0.5; // m/s of an arrow key on the dial

@@ -10,10 +10,10 @@ from pathlib import Path
 
 from bench.runner import ROOT, Row, study
 from bench.speed.timing import seconds
+from gaussian_swaying.player.film.page import write_film
+from gaussian_swaying.player.live_web.block import pack_solver
+from gaussian_swaying.player.live_web.page import PAGE, write_live_web
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.viewer.film.page import write_film
-from gaussian_swaying.viewer.live_web.block import pack_solver
-from gaussian_swaying.viewer.live_web.page import PAGE, write_live_web
 
 
 @study("pages", [{"config": "flag", "frames": 75}])

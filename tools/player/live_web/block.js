@@ -1,4 +1,4 @@
-// Reads the block that viewer/live_web/block.py packs: the length of its head, the head, and its arrays.
+// Reads the block that player/live_web/block.py packs: the length of its head, the head, and its arrays.
 
 const WHOLE = { i1: Int8Array, i2: Int16Array, i4: Int32Array };
 

@@ -1,4 +1,4 @@
-// What both solvers have: the package's own kernels in WebAssembly, which gaussian_swaying/viewer/live_web/kernels.py writes into the block,
+// What both solvers have: the package's own kernels in WebAssembly, which gaussian_swaying/player/live_web/kernels.py writes into the block,
 // the memory that they work in, the wind, and the pull of the visitor.
 import { Wind } from "./wind.js";
 

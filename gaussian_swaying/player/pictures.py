@@ -1,0 +1,223 @@
+"""Pictures of a snapshot from the camera of a browser, as large as the machine can keep up with."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from gaussian_swaying._devices import in_double
+from gaussian_swaying.player.session import Snapshot
+from gaussian_swaying.recording.video import VideoEncoder
+from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.rendering.passes import PASSES
+from gaussian_swaying.rendering.tints import by_role
+from gaussian_swaying.simulation.body import SimulatedScene
+from gaussian_swaying.simulation.draw import View
+
+LEAST = 96  # pixels of the shorter side
+SIZES = (1.0, 0.75, 0.5, 0.375, 0.25)
+MOST_SIDE = 16384  # pixels of a browser's window
+FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))  # to a camera with y down and z forward
+
+
+@dataclass(frozen=True)
+class Eye:
+    """How a browser looks at the scene.
+
+    Attributes:
+        matrix: From the axes of its camera, y up and z backwards, to those of a film, float64, shape (4, 4).
+        fov: Vertical field of view [rad].
+        near: Nearest depth that is drawn, in units of a film.
+        size: Width and height of its window [pixels].
+    """
+
+    matrix: Tensor
+    fov: float
+    near: float
+    size: tuple[int, int]
+
+    @classmethod
+    def told(cls, message: Mapping[str, Any]) -> Eye:
+        """From a message with ``matrix`` (column by column), ``fov`` [degrees], ``near`` and ``size``."""
+        matrix = torch.tensor(message["matrix"], dtype=torch.float64).reshape(4, 4).T
+        fov, near = math.radians(message["fov"]), float(message["near"])
+        width, height = (int(side) for side in message["size"])
+        if not (bool(matrix.isfinite().all()) and 0 < fov < math.pi and 1e-9 < near < 1e9):
+            raise ValueError("the view is not finite")
+        if not (0 < width <= MOST_SIDE and 0 < height <= MOST_SIDE):
+            raise ValueError(f"the window is not of 1 to {MOST_SIDE} pixels")
+        return cls(matrix, fov, near, (width, height))
+
+    def camera(self, scene: SimulatedScene, width: int, height: int) -> Camera:
+        """The camera of a picture with so many pixels, in scene units."""
+        rotation = scene.frame.rotation.T.cpu().double() @ self.matrix[:3, :3] @ FLIP
+        place = scene.frame.point_to_scene(self.matrix[:3, 3] * scene.size * scene.frame.metres_per_unit)
+        view = torch.eye(4, dtype=torch.float64)
+        view[:3, :3], view[:3, 3] = rotation.mT, -rotation.mT @ place
+        focal = 0.5 * height / math.tan(0.5 * self.fov)
+        intrinsics = torch.tensor([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]]).double()
+        return Camera(view, intrinsics, width, height, self.near * scene.size)
+
+
+@torch.inference_mode()
+def draw(
+    snapshot: Snapshot,
+    camera: Camera,
+    shown: str = "color",
+    force_end: float = 1.0,
+    roles: Tensor | None = None,
+) -> np.ndarray:
+    """The picture of a snapshot, uint8, shape (H, W, 3).
+
+    Args:
+        snapshot: The snapshot to draw.
+        camera: The camera.
+        shown: The name of a pass.
+        force_end: End of the colour scale of the wind force [Pa].
+        roles: Roles whose tints the colours get, as in :func:`~gaussian_swaying.rendering.tints.by_role`, shape (N,).
+    """
+    painter, state = snapshot.simulation.painter, snapshot.state
+    means = painter.scene.model.means
+    camera, gaussians, colours = camera.to(means.device, means.dtype), painter.deformed(state), None
+    if roles is not None and len(roles) == len(gaussians.means):  # not those of a scene that was just replaced
+        colours = by_role(painter.colors(gaussians, camera), roles)
+    picture = PASSES[shown].draw(View(painter, state, gaussians, camera, colours, True, force_end))
+    return (picture.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
+
+
+def enlarged(picture: np.ndarray, width: int, height: int) -> np.ndarray:
+    """A picture that was drawn small, with smooth edges at the size at which it is shown; uint8, shape (H, W, 3).
+
+    A browser would enlarge it linearly, which shows the pixels as steps, and the blocks of its JPEG as noise at edges.
+    """
+    if picture.shape[:2] == (height, width):
+        return picture
+    return np.asarray(Image.fromarray(np.ascontiguousarray(picture)).resize((width, height), Image.Resampling.LANCZOS))
+
+
+@torch.inference_mode()
+def under_cursor(snapshot: Snapshot, origin: Sequence[float], direction: Sequence[float]) -> list[float] | None:
+    """The place of the first Gaussian that a ray meets [scene units]; None if it meets nothing that can be seen.
+
+    Args:
+        snapshot: The snapshot to draw.
+        origin: Start of the ray [scene units].
+        direction: Its direction, of any length.
+    """
+    scene = snapshot.simulation.scene
+    means = snapshot.simulation.painter.deformed(snapshot.state).means
+    seen = (scene.model.opacity() > 0.2).to(means.device)
+    means = in_double(means)
+    start = torch.tensor(list(origin), dtype=torch.float64, device=means.device)
+    along = torch.nn.functional.normalize(torch.tensor(list(direction), dtype=torch.float64), dim=0).to(means)
+    depth = (means - start) @ along
+    beside = torch.linalg.vector_norm(means - start - depth[:, None] * along, dim=-1)
+    seen &= depth > 0
+    if not scene.all_move:
+        moves = torch.zeros_like(seen)
+        moves[scene.moving.to(moves.device)] = True
+        seen &= moves
+    near = seen & (beside < 0.02 * scene.size)
+    if not bool(near.any()):
+        return None
+    return [float(x) for x in means[depth.where(near, math.inf).argmin()]]
+
+
+class PictureSize:
+    """Chooses the size of pictures so that drawing one takes about as long as it may.
+
+    Args:
+        seconds: Time that a picture may take [s].
+        largest: Most pixels of the longer side.
+        level: First index in :data:`SIZES`.
+    """
+
+    def __init__(self, seconds: float = 0.08, largest: int = 1920, level: int = 0) -> None:
+        self.seconds, self.largest, self._level = seconds, largest, level
+
+    def fit(self, width: int, height: int, still: bool = False) -> tuple[int, int]:
+        """Size for a window of these pixels; the same shape, and even. If nothing moves, as large as it may be."""
+        width, height = max(width, 1), max(height, 1)
+        largest = min(1.0, self.largest / max(width, height))
+        scale = largest if still else largest * SIZES[self._level]
+        scale = min(max(scale, LEAST / min(width, height)), largest)
+        return max(2 * round(width * scale / 2), 2), max(2 * round(height * scale / 2), 2)
+
+    def took(self, seconds: float) -> None:
+        while seconds > 1.3 * self.seconds and self._level < len(SIZES) - 1:
+            seconds *= (SIZES[self._level + 1] / SIZES[self._level]) ** 2  # about as many pixels as it takes time
+            self._level += 1
+        if seconds < 0.3 * self.seconds and self._level > 0:
+            self._level -= 1
+
+
+FPS = 25.0
+LONGEST = 120.0  # s
+
+
+class FilmStrip:
+    """Collects pictures and encodes them so that the video shows real time, however slowly they come."""
+
+    def __init__(self) -> None:
+        self._folder = tempfile.TemporaryDirectory()
+        self._path = Path(self._folder.name) / "video.mp4"
+        self._encoder = VideoEncoder(self._path, FPS)
+        self._start: float | None = None
+        self._size: tuple[int, ...] | None = None
+        self._last: np.ndarray | None = None
+        self._frames = 0
+        self._lock, self._done = threading.Lock(), False
+
+    @property
+    def seconds(self) -> float:
+        """Length so far [s]."""
+        return self._frames / FPS
+
+    @property
+    def full(self) -> bool:
+        """True if the video has its greatest length, and takes no more pictures."""
+        return self.seconds >= LONGEST
+
+    def add(self, time: float, picture: np.ndarray) -> None:
+        """Add a picture, uint8 (H, W, 3), at a simulated time [s]; it gets the size of the first."""
+        with self._lock:
+            if not self._done and not self.full:
+                self._add(time, picture)
+
+    def _add(self, time: float, picture: np.ndarray) -> None:
+        if self._size is None:
+            self._start, self._size = time, picture.shape
+        if picture.shape != self._size:
+            picture = np.asarray(Image.fromarray(picture).resize((self._size[1], self._size[0])))
+        assert self._start is not None
+        wanted = int((time - self._start) * FPS) + 1
+        if wanted < self._frames:  # the simulation went back to rest: go on from there
+            self._start, wanted = time - self._frames / FPS, self._frames + 1
+        while self._frames < wanted:
+            early = self._last if wanted - self._frames > 1 else None
+            self._encoder.write(picture if early is None else early)
+            self._frames += 1
+        self._last = picture
+
+    def finish(self) -> bytes:
+        """The video as .mp4."""
+        with self._lock:
+            self._done = True
+        try:
+            if self._frames == 0:
+                raise ValueError("Nothing was recorded, as nothing moved: go on before you record.")
+            self._encoder.finish()
+            return self._path.read_bytes()
+        finally:
+            self._encoder.abort()
+            self._folder.cleanup()
