@@ -294,6 +294,23 @@ def test_the_bar_and_the_panel_steer_the_session(page, drawing):
     assert window.problems == []
 
 
+def test_a_window_records_what_it_shows(page, drawing, tmp_path):
+    iio, window = pytest.importorskip("imageio.v3"), drawing
+    window.get_by_role("button", name="Controls").click()
+    window.locator("summary", has_text="Files").click()
+    window.get_by_role("button", name="Record a video").click()
+    reached(page.session, page.session.snapshot.health.time + 0.5)
+    with window.expect_download(timeout=30_000) as download:
+        window.get_by_role("button", name="Stop recording").click()
+    assert download.value.suggested_filename == "wind.webm"
+    download.value.save_as(tmp_path / "wind.webm")
+    frames = iio.imread(tmp_path / "wind.webm").astype(int)
+    assert len(frames) > 1
+    assert np.abs(frames[-1] - frames[0]).max() > 20  # it moves
+    window.get_by_role("button", name="Record a video").wait_for()
+    assert window.problems == []
+
+
 def test_a_link_sets_what_it_says(page, browser):
     context = browser.new_context(viewport={"width": 500, "height": 400})
     window = listened(context.new_page())
