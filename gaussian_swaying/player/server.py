@@ -559,12 +559,8 @@ class Server:
     async def _grab(self, client: Client, session: Session, said: Mapping[str, Any]) -> None:
         frame = session.simulation.scene.frame
         origin = self._place(said["eye"])
-        ray = [
-            b - a
-            for a, b in zip(
-                origin, self._place([sum(x) for x in zip(said["eye"], said["ray"], strict=True)]), strict=True
-            )
-        ]
+        end = self._place([sum(x) for x in zip(said["eye"], said["ray"], strict=True)])
+        ray = [b - a for a, b in zip(origin, end, strict=True)]
 
         def find() -> list[float] | None:
             with session.lock:
@@ -614,7 +610,7 @@ class Server:
         session = self.session
         if session is not None:
             with suppress(Exception):  # a moment in which a scene is replaced
-                rates, health = session.rates(), session.snapshot.health
+                health = session.snapshot.health
                 elsewhere = self.door.token is not None
                 found["panel"] = {"groups": self.panel.groups(), "legends": self.panel.legends()}
                 found["panel"] |= {"together": list(TOGETHER), "elsewhere": elsewhere}
@@ -623,9 +619,9 @@ class Server:
                 found["panel"] |= self._first[1]
                 found["painting"] = self.painting.shown()
                 figures |= {"paused": session.paused, "speed": session.speed, "broken": session.broken}
-                figures |= {"problem": session.problem, "undo": session.changes, "rate": rates.real_time}
+                figures |= {"problem": session.problem, "undo": session.changes, "rate": session.rate()}
                 figures |= {"pictures": round(max((one.rate for one in self.clients), default=0.0))}
-                figures |= {"time": health.time, "substeps": rates.substeps, "step": rates.step}
+                figures |= {"time": health.time, "substeps": health.substeps, "step": session.simulation.frame_dt}
                 figures |= {"stretch": [health.stretch_min, health.stretch_max], "held": session.pulls}
         self._texts = (now, settings, found)
         return found

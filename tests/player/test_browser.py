@@ -203,7 +203,7 @@ def test_pictures_change_between_states_and_never_show_the_future(page, drawing)
     """The simulation gives few states a second; the time that is shown rises from picture to picture."""
     session, window = page.session, drawing
     session.pace(0.02)
-    until(lambda: session.rates().real_time < 0.05)
+    until(lambda: session.rate() < 0.05)
     window.evaluate("""() => {
         window.seen = [];
         const look = () => {
