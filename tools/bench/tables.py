@@ -151,7 +151,7 @@ AIR = "air.md"
 SECTIONS["known.accuracy"] = lambda: _known("accuracy.md")
 SECTIONS["known.air"] = lambda: _known(AIR)
 
-# ---- web.md, wind.md, contact.md
+# ---- web.md, contact.md
 
 table(
     "speed.pages", "pages",
@@ -160,15 +160,6 @@ table(
     lambda run: f"{run.config} | {run.count:,} | {run.points:,} | {run.bytes / 1e6:.1f} | {run.bundle_bytes / 1e6:.1f} "
     f"| {100 * run.error_of_size:.2g} | {run.page_bytes / 1e6:.1f} | {run.real_time:.2f} | {run.real_time_longest:.2f}",
 )  # fmt: skip
-
-
-def _wind(run: Run) -> str:
-    ratios = " | ".join(f"{own['ratio']:.2f}" for name, own in run.winds.items() if name in WINDS)
-    return f"{_on(run)} | `{run.formulation}` | {run.particles:,} | {run.winds['uniform']['median_ms']:.3g} | {ratios}"
-
-
-WINDS = ("turbulence", "profile, turbulence", "profile, turbulence, shelter", "cylinder")
-table("speed.winds", "winds", " | ".join(["device", "formulation", "points", "uniform gusts [ms]", *WINDS]), _wind)
 
 
 def _contact() -> str:
