@@ -75,9 +75,6 @@ def draw(
     """The picture of a snapshot, uint8, shape (H, W, 3).
 
     Args:
-        snapshot: The snapshot to draw.
-        camera: The camera.
-        shown: The name of a pass.
         force_end: End of the colour scale of the wind force [Pa].
         roles: Roles whose tints the colours get, as in :func:`~gaussian_swaying.rendering.tints.by_role`, shape (N,).
     """
@@ -95,9 +92,7 @@ def under_cursor(snapshot: Snapshot, origin: Sequence[float], direction: Sequenc
     """The place of the first Gaussian that a ray meets [scene units]; None if it meets nothing that can be seen.
 
     Args:
-        snapshot: The snapshot to draw.
         origin: Start of the ray [scene units].
-        direction: Its direction, of any length.
     """
     scene = snapshot.simulation.scene
     means = snapshot.simulation.painter.deformed(snapshot.state).means

@@ -89,13 +89,7 @@ class Door:
         self.token = None if host in LOCAL else secrets.token_urlsafe(16)
 
     def refusal(self, headers: Mapping[str, str], given: Sequence[str] = (), address: str = "") -> str | None:
-        """The reason why a request is refused, or None.
-
-        Args:
-            headers: Of the request.
-            given: The tokens in its link and in its cookie.
-            address: Address of this computer at which the request arrived.
-        """
+        """The reason why a request is refused, or None."""
         asked, origin = headers.get("Host") or "", headers.get("Origin")
         try:
             name = urlsplit(f"//{asked}").hostname or ""
@@ -129,8 +123,6 @@ def colour_message(simulation: Simulation, film: Film, roles: Tensor, known: Ten
     Their places in the film (uint32), and red, green and blue of each (uint8).
 
     Args:
-        simulation: The simulation.
-        film: Its Gaussians at rest.
         roles: Their roles in the splat, see :func:`~gaussian_swaying.rendering.tints.by_role`, shape (N,).
         known: The same before.
     """
@@ -152,7 +144,6 @@ def state_message(snapshot: Snapshot, ended: bool) -> bytes:
     """The displacement of the nodes of a state: 6 bytes each, and 16 more for one that moved far.
 
     Args:
-        snapshot: The snapshot.
         ended: Whether no other state follows for now.
     """
     simulation, scene = snapshot.simulation, snapshot.simulation.scene

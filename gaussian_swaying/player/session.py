@@ -49,8 +49,6 @@ def changed_settings(parser: ArgumentParser, settings: Namespace, values: Mappin
     """Settings with other values. Parameters are checked and set; only other fields are parsed anew.
 
     Args:
-        parser: From :meth:`Simulation.parser`.
-        settings: Settings from it.
         values: New values by the names of their fields, with dots, or of parameters.
     """
     numbers = {name: value for name, value in values.items() if find(name) is not None}
@@ -80,12 +78,6 @@ def take(simulation: Simulation, parser: ArgumentParser, settings: Namespace, va
 
     Parameters, the wind, aerodynamic coefficients, shading, background and length of a frame change in motion; the
     material only if it is the same everywhere.
-
-    Args:
-        simulation: The simulation.
-        parser: From :meth:`Simulation.parser`.
-        settings: The settings with all changes.
-        values: New values of numbers by their names, and the other fields that have changed, with dots.
 
     Returns:
         False if another field has changed, so that the simulation has to be made anew.
@@ -149,8 +141,6 @@ class Pull(Force):
         """Make a pull on the particles around a place.
 
         Args:
-            scene: The simulated scene.
-            state: Its state now.
             place: The place [scene units].
         """
         position, mass = state.position.detach(), scene.points.mass
@@ -190,8 +180,6 @@ class Snapshot:
     """The simulation, its state and its measurements at one time.
 
     Attributes:
-        simulation: The simulation.
-        state: Its state.
         health: Measurements at the end of the last step.
         number: Counts the snapshots of a session.
         motion: Counts the motions of a session: another one begins at rest.
@@ -235,13 +223,8 @@ def settings_of_splat(
     """The settings that the preview suggests for a splat.
 
     Args:
-        parser: From :meth:`Simulation.parser`.
-        path: The splat.
-        device: Device of the simulation.
         folder: Gets ``parts.npz``, which the settings name, if the splat has parts.
-        further: Options that replace what is suggested.
         tell: Called with the share that is done, from 0 to 1, and the name of the next task.
-        quick: Whether the grid is a coarser one than that of its starter.
     """
     tell(0.05, "Reading the splat")
     with spare_memory(SPARE):
@@ -335,9 +318,7 @@ class Session:
         """Go on with another scene, from rest.
 
         Args:
-            settings: Its settings.
             done: Called in the thread of the session once the scene is there; not if it cannot be made.
-            ended: Called there in both cases.
         """
 
         def take_scene() -> None:
@@ -619,7 +600,6 @@ class Choice:
 
     Attributes:
         settings: The settings with it.
-        simulation: Their simulation.
         sentence: What was chosen, and how to get the configured grid.
     """
 
@@ -629,13 +609,7 @@ class Choice:
 
 
 def in_real_time(parser: ArgumentParser, settings: Namespace, simulation: Simulation) -> Choice:
-    """Choose the finest grid, not finer than the configured one, on which this machine keeps up with real time.
-
-    Args:
-        parser: From :meth:`Simulation.parser`.
-        settings: The settings as they were configured.
-        simulation: Their simulation.
-    """
+    """Choose the finest grid, not finer than the configured one, on which this machine keeps up with real time."""
     configured = float(settings.solver.dx)
     made = {configured: (settings, simulation)}
     frames = 1 + max(1, round(MOTION / simulation.frame_dt))
@@ -660,7 +634,6 @@ def finest_within(
 
     Args:
         cost: Cost for a grid spacing [m]; ValueError where the grid is too coarse for the scene, such as for a pin.
-        wish: The largest cost.
         configured: Smallest grid spacing [m]; its errors are raised.
         coarsest: Largest grid spacing [m]; if it is less than ``configured``, that one is kept.
     """
@@ -700,7 +673,6 @@ def sentence(configured: float, chosen: float, configured_speed: float, speed: f
         configured: Its spacing [m].
         chosen: Spacing of the grid that was chosen [m].
         configured_speed: Simulated seconds per second on the configured grid.
-        speed: The same on the one that was chosen.
     """
     fast = f"predicted to run at {speed:.2g} x real time here"
     if chosen == configured:
