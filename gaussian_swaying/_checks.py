@@ -55,7 +55,7 @@ def check_plain(name: str, value: Any) -> None:
     if any(map(requires_grad, items)):
         raise ValueError(
             f"Expected `{name}` without a gradient, which would be lost: give plain numbers (`tensor.detach()`); "
-            "docs/python.md lists what keeps its gradient."
+            "docs/configuration.md lists what keeps its gradient."
         )
 
 

@@ -204,23 +204,6 @@ class Snapshot:
     motion: int = 0
 
 
-@dataclass(frozen=True)
-class Rates:
-    """The speed of a session.
-
-    Attributes:
-        steps: Steps per second.
-        real_time: Simulated seconds per second.
-        step: Length of a step [s].
-        substeps: Substeps of the last step.
-    """
-
-    steps: float
-    real_time: float
-    step: float
-    substeps: int
-
-
 @dataclass
 class Past:
     """The settings before a change, to undo it.
@@ -435,17 +418,16 @@ class Session:
         """The configuration as it is now; ``gaussian-swaying sim --config`` starts from it."""
         return config_text(self.parser, self.settings)
 
-    def rates(self) -> Rates:
+    def rate(self) -> float:
+        """Simulated seconds per second, lately."""
         steps, now = list(self._steps), time.perf_counter()
         steps = [step for step in steps if now - step[0] < WINDOW]
-        health, simulation = self.snapshot.health, self.simulation
         if len(steps) < 2:
-            return Rates(0.0, 0.0, simulation.frame_dt, health.substeps)
+            return 0.0
         between = steps[-1][0] - steps[0][0]
         overdue = now - steps[-1][0] - between / (len(steps) - 1)  # a step that is under way is not late yet
         took = max(between + max(overdue, 0.0), 1e-6)
-        passed = steps[-1][1] - steps[0][1]
-        return Rates((len(steps) - 1) / took, passed / took, simulation.frame_dt, health.substeps)
+        return (steps[-1][1] - steps[0][1]) / took
 
     # ---- in the thread
 
