@@ -1,7 +1,6 @@
 // The live page: draws the states of a simulation that runs on a server, and steers it. See docs/live.md.
 import { Brush } from "./brush.js";
-import { blocks } from "./bundle.js";
-import { reader, writeNodes } from "./gaussians.js";
+import { blocks, readHead, writeNodes } from "./bundle.js";
 import { button, element, make } from "./panel.js";
 import { Tunnel } from "./tunnel.js";
 import { View } from "./view.js";
@@ -119,10 +118,8 @@ class Live {
   }
 
   async open() {
-    const file = blocks("scene.sway");
-    const next = async () => (await file.next()).value;
-    const head = JSON.parse(new TextDecoder().decode(await next()));
-    const stencils = reader(await next())(Uint32Array, 27 * head.stencils);
+    const next = await blocks("scene.sway");
+    const [head, stencils] = await readHead(next);
     this.tunnel.playback.clear();
     await this.view.open(head, stencils, next);
     for (let index = head.start; index < head.parts.length; index++) await this.view.take(index);
