@@ -66,7 +66,7 @@ def test_a_simulation(show, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["export", "--live-web", "flag", *SMALL, "--material.E=9e3"]) == 0
     page = show(tmp_path / "flag.html", "!!window.windPage")
-    page.evaluate("windPage.complete.then(() => { windPage.pause(); windPage.reset(); })")
+    page.evaluate("windPage.complete.then(() => { windPage.tunnel.setPlaying(false); windPage.tunnel.reset(); })")
     before = drawn(page)
     assert page.evaluate("windPage.advance(25)")["simulated"] == pytest.approx(1.0)
     check_motion(page, before)

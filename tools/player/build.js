@@ -68,6 +68,6 @@ await build({
   bundle: true,
   minify: true,
   format: "iife",
-  banner: await banner(["build.js", ...SOLVER, "package-lock.json"]),
+  banner: await banner(["build.js", "bundle.js", ...SOLVER, "package-lock.json"]),
   logLevel: "info",
 });

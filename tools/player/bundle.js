@@ -13,6 +13,9 @@ export function reader(bytes) {
   };
 }
 
+/** A number whose sign is in its last bit. @param {number} value */
+export const unfold = (value) => (value >> 1) ^ -(value & 1);
+
 /** Writes the displacements of all nodes [m], four numbers each: `near` has steps, `far` index and displacement of the few that swing far. */
 export function writeNodes(data, near, far, step) {
   for (let i = 0, at = 0; i < near.length; i += 3, at += 4) {
@@ -32,7 +35,7 @@ const STEP = 16; // bytes of a texel
 export const texels = (count, Kind = Uint32Array) => new Kind(4 * WIDTH * Math.max(1, Math.ceil(count / WIDTH)));
 
 /** Writes Gaussians of a kind into the textures with some names, from a place on, and returns how many; see pack_splats in page.py. */
-export function fill(kind, bytes, from, /** @type {(name: string) => Uint32Array} */ texture) {
+export function fill({ cell, corner }, kind, bytes, from, /** @type {(name: string) => Uint32Array} */ texture) {
   const sizes = TEXELS[kind];
   const count = bytes.length / Object.values(sizes).reduce((sum, size) => sum + size);
   let at = 0;
@@ -40,6 +43,9 @@ export function fill(kind, bytes, from, /** @type {(name: string) => Uint32Array
     const out = new Uint8Array(texture(name).buffer, STEP * from, STEP * count);
     for (let k = 0; k < sizes[name]; k++) for (let i = k; i < out.length; i += STEP) out[i] = bytes[at++];
   }
+  if (kind === "still") return count;
+  const [rest, place] = ["rest", "place"].map((name) => new Float32Array(texture(name).buffer, STEP * from, 4 * count));
+  for (let i = 0; i < 4 * count; i++) if (i % 4 < 3) place[i] = (rest[i] - corner[i % 4]) / cell - place[i]; // it has the arm
   return count;
 }
 
@@ -96,7 +102,7 @@ export class Frames {
     const end = begin + count * this.row;
     const size = 2 * (end - begin);
     const folded = reader(bytes.subarray(0, size))(Uint16Array, end - begin); // differences to the frame before, the sign in the last bit
-    folded.forEach((value, k) => (this.near[begin + k] = ((value >> 1) ^ -(value & 1)) + (this.near[begin + k - this.row] ?? 0)));
+    folded.forEach((value, k) => (this.near[begin + k] = unfold(value) + (this.near[begin + k - this.row] ?? 0)));
     this.far.push(...readFar(bytes.subarray(size), count));
   }
 

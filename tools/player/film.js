@@ -1,6 +1,6 @@
 // A film of Gaussians: splats once, the displacement of grid nodes per frame. See docs/web.md.
 import { Frames, readHead } from "./bundle.js";
-import { button, element } from "./panel.js";
+import { button, element, make, playButton } from "./panel.js";
 import { View } from "./view.js";
 
 // `read(name)` gives a part of the file once it is there; `tell(sentence)` is called if the file ends too early.
@@ -14,10 +14,10 @@ export async function play(read, tell) {
   await view.open(head, stencils, read);
   view.aimAsWritten();
 
-  const play = button("play", "❚❚", "Pause", () => setPlaying(!state.playing));
-  const slider = Object.assign(document.createElement("input"), { id: "time", type: "range", min: 0, max: head.frames - 1, value: 0 });
+  const [play, showPlaying] = playButton(() => setPlaying(!state.playing));
+  const slider = make("input", { id: "time", type: "range", min: 0, max: head.frames - 1, value: 0 });
   slider.setAttribute("aria-label", "Time");
-  const clock = Object.assign(document.createElement("span"), { id: "clock" });
+  const clock = make("span", { id: "clock" });
   const loop = button("loop", "⟳", "Loop", () => loop.setAttribute("aria-pressed", String(!looping())));
   loop.setAttribute("aria-pressed", "true");
   element("bar").append(play, slider, clock, loop);
@@ -43,18 +43,12 @@ export async function play(read, tell) {
     if (on && state.frame === head.frames - 1) seek(0);
     state.playing = on;
     state.last = null;
-    play.textContent = on ? "❚❚" : "▶";
-    play.setAttribute("aria-label", on ? "Pause" : "Play");
+    showPlaying(on);
   }
 
   slider.addEventListener("input", () => {
     setPlaying(false);
     seek(Number(slider.value));
-  });
-  window.addEventListener("keydown", (event) => {
-    if (event.key !== " " || /** @type {Element} */ (event.target).closest?.("button")) return;
-    event.preventDefault();
-    setPlaying(!state.playing);
   });
 
   function tick(now) {
@@ -91,8 +85,7 @@ export async function play(read, tell) {
   window.film = {
     head,
     frame: () => state.frame,
-    drawn: () => view.drawn,
-    first: () => view.first,
+    view,
     complete,
     pause: () => setPlaying(false),
     play: () => setPlaying(true),
@@ -102,7 +95,6 @@ export async function play(read, tell) {
       seek(frame);
       await view.settled();
     },
-    positions: () => view.positions(),
     order,
   };
 }

@@ -29,11 +29,8 @@ const COVSPLAT = (i, o) => `
 // The Gaussians of one kind: all those that move, or all others. They come in parts, the first ones spread over the whole
 // scene. Until all are there, each is larger, so that they cover as much as all of them.
 class Layer {
-  constructor(kind, count, shared) {
-    this.kind = kind;
-    this.count = count;
-    this.loaded = 0;
-    this.textures = {};
+  constructor(head, kind, count, shared) {
+    Object.assign(this, { head, kind, count, loaded: 0, textures: {} });
     this.inputs = { ...shared, grown: new dyno.DynoFloat({ value: 1 }) };
     for (const name in TEXELS[kind]) {
       this.textures[name] = texture(texels(count));
@@ -66,7 +63,7 @@ class Layer {
 
   // Add the next Gaussians, see pack_splats in page.py.
   add(bytes) {
-    const count = fill(this.kind, bytes, this.loaded, (name) => this.textures[name].image.data);
+    const count = fill(this.head, this.kind, bytes, this.loaded, (name) => this.textures[name].image.data);
     for (const made of Object.values(this.textures)) {
       for (let row = Math.floor(this.loaded / WIDTH); row * WIDTH < this.loaded + count; row++)
         made.addUpdateRange(4 * WIDTH * row, 4 * WIDTH);
@@ -93,8 +90,9 @@ class Layer {
 
 // All Gaussians of a film or a scene, in units of the object's size with z up; `group` goes into a scene that Spark draws.
 export class Splat {
-  constructor(head, stencils) {
-    this.count = head.count;
+  /** @param {any} head @param {Uint32Array} stencils */
+  constructor(head, stencils, changed = () => {}) {
+    Object.assign(this, { count: head.count, told: changed });
     this.moved = texture(texels(head.nodes, Float32Array));
     this.rows = texture(rowsOf(stencils));
     this.inputs = {
@@ -108,8 +106,8 @@ export class Splat {
       kind: new dyno.DynoVec4({ value: new THREE.Vector4() }),
     };
     this.layers = {
-      moving: new Layer("moving", head.moving, this.inputs),
-      still: new Layer("still", head.count - head.moving, {}),
+      moving: new Layer(head, "moving", head.moving, this.inputs),
+      still: new Layer(head, "still", head.count - head.moving, {}),
     };
     this.group = new THREE.Group();
     this.group.add(this.layers.moving.group, this.layers.still.group);
@@ -119,6 +117,7 @@ export class Splat {
   // Add the next Gaussians that are "moving", or "still".
   add(kind, bytes) {
     if (bytes.length > 0) this.layers[kind].add(bytes);
+    this.told();
   }
 
   // From now on they follow the nodes; until then all are at rest, so that the first picture needs no long shader.
@@ -155,6 +154,7 @@ export class Splat {
 
   changed() {
     this.layers.moving.generator.updateVersion();
+    this.told();
   }
 
   dispose() {
@@ -193,37 +193,15 @@ export class Drawing {
       onDirty: () => this.wake(1),
     });
     this.spark.sortWorker = makeSorter();
-    this.splat = new Splat(head, stencils);
+    this.splat = new Splat(head, stencils, () => this.wake(3)); // Spark draws what it computed for the picture before
     this.scene.add(this.spark, this.splat.group);
     this.light(head);
-  }
-
-  // As those of Splat; Spark draws what it computed for the picture before.
-  add(kind, bytes) {
-    this.splat.add(kind, bytes);
-    this.wake(3);
-  }
-
-  follow() {
-    this.splat.follow();
-    this.wake(3);
-  }
-
-  move(fill) {
-    this.splat.move(fill);
-    this.wake(3);
-  }
-
-  recolour(places, colours) {
-    this.splat.recolour(places, colours);
-    this.wake(3);
   }
 
   // Light and background, as in the head.
   light(head) {
     this.splat.light(head);
     this.renderer.setClearColor(new THREE.Color().setRGB(...head.background, THREE.SRGBColorSpace));
-    this.wake(3);
   }
 
   // Compute and sort what has come, while the shaders of the picture are compiled; the next picture shows it.

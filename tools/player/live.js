@@ -97,7 +97,7 @@ class Live {
     else if (kind === "painting") this.showPanel(this.panel, (this.painting = message));
     else if (kind === "grabbed") this.tunnel.grabbed(message);
     else if (kind === "look") drawing.light(message);
-    else if (kind === "colours") drawing.recolour(new Uint32Array(message.rest.buffer, 0, message.count), message.rest.subarray(4 * message.count));
+    else if (kind === "colours") drawing.splat.recolour(new Uint32Array(message.rest.buffer, 0, message.count), message.rest.subarray(4 * message.count));
     else if (kind === "scene") await this.open();
     else if (kind === "picture") {
       const [width, height] = [innerWidth, innerHeight].map((side) => Math.round(side * devicePixelRatio));
@@ -124,7 +124,7 @@ class Live {
     await this.view.open(head, stencils, next);
     for (let index = head.start; index < head.parts.length; index++) await this.view.take(index);
     this.view.whole = true;
-    this.view.drawing.follow();
+    this.view.drawing.splat.follow();
     this.view.resize();
   }
 

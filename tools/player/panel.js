@@ -21,6 +21,17 @@ export function button(id, text, label, act) {
   return made;
 }
 
+/** The button that plays and pauses, which the space bar presses as well, and what shows its state. @returns {[any, (on: boolean) => void]} */
+export function playButton(act) {
+  const made = button("play", "❚❚", "Pause", act);
+  addEventListener("keydown", (event) => {
+    if (event.key !== " " || /** @type {Element} */ (event.target).closest?.("button, input:not([type=range]), select, summary")) return;
+    event.preventDefault();
+    act();
+  });
+  return [made, (on) => (made.textContent = on ? "❚❚" : "▶") && made.setAttribute("aria-label", on ? "Pause" : "Play")];
+}
+
 /** A number with three digits. @param {number} value */
 const short = (value) => String(Number(value.toPrecision(3)));
 

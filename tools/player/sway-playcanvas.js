@@ -34,7 +34,7 @@ export class SwayingSplat extends pc.Script {
       Object.assign(data, { rows: rowsOf(stencils), moved: texels(head.nodes, Float32Array) });
       loaded.still = head.moving;
     };
-    await readFilm(this.url, begin, (kind, bytes) => (loaded[kind] += fill(kind, bytes, loaded[kind], (name) => data[name])));
+    await readFilm(this.url, begin, (kind, bytes) => (loaded[kind] += fill(head, kind, bytes, loaded[kind], (name) => data[name])));
     this.open(device, head, data);
     this.frames = frames; // from now on it is drawn
   }

@@ -1,6 +1,6 @@
 // What the live page and a page that simulates share: the bar, the panel, the pull, the link, and states in step with the clock.
 import * as THREE from "three";
-import { button, element, Panel } from "./panel.js";
+import { button, element, Panel, playButton } from "./panel.js";
 import { Playback } from "./playback.js";
 
 const SLOW = 0.25; // simulated seconds per second in slow motion
@@ -32,11 +32,12 @@ export class Tunnel {
       this.changed.set(name, value);
       set(name, value);
     });
-    this.play = button("play", "❚❚", "Pause", () => this.setPlaying(!this.playing));
+    const [play, show] = playButton(() => this.setPlaying(!this.playing));
+    this.showPlaying = (on) => show((this.playing = on));
     this.slow = button("slow", "Slow", "Slow motion", () => this.setSpeed(this.speed < 1 ? 1 : SLOW));
     const reset = button("reset", "Reset", "Back to rest", () => this.reset());
     const more = button("more", "☰", "Controls", () => this.open(element("panel").hidden));
-    element("bar").append(this.play, this.slow, reset, ...further, button("link", "Link", "Copy a link with these settings", () => this.copy()), more);
+    element("bar").append(play, this.slow, reset, ...further, button("link", "Link", "Copy a link with these settings", () => this.copy()), more);
     this.open(innerWidth > 900);
     this.listen();
     this.follow();
@@ -51,12 +52,6 @@ export class Tunnel {
 
   run() {
     this.say({ kind: "run", on: this.playing && !document.hidden, speed: this.speed });
-  }
-
-  showPlaying(on) {
-    this.playing = on;
-    this.play.textContent = on ? "❚❚" : "▶";
-    this.play.setAttribute("aria-label", on ? "Pause" : "Play");
   }
 
   setPlaying(on) {
@@ -75,11 +70,6 @@ export class Tunnel {
   }
 
   listen() {
-    addEventListener("keydown", (event) => {
-      if (event.key !== " " || /** @type {Element} */ (event.target).closest?.("button, input, select, summary")) return;
-      event.preventDefault();
-      this.setPlaying(!this.playing);
-    });
     addEventListener("hashchange", () => this.apply(location.hash, true));
     addEventListener("message", ({ data }) => {
       // what <gaussian-swaying> says when its attributes change

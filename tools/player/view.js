@@ -80,7 +80,7 @@ export class View {
   async take(index) {
     const [kind, first, last] = this.head.parts[index];
     const bytes = await this.read(`part-${index}`);
-    if (kind === "moving" || kind === "still") this.drawing.add(kind, bytes);
+    if (kind === "moving" || kind === "still") this.drawing.splat.add(kind, bytes);
     else this.takeOther(kind, bytes, last - first);
   }
 
@@ -104,7 +104,7 @@ export class View {
   // Move the nodes, as Drawing does.
   move(fill) {
     this.stirred = performance.now();
-    this.drawing.move(fill);
+    this.drawing.splat.move(fill);
   }
 
   // Draw from now on; `tick(now)` is called before each picture.
@@ -158,7 +158,7 @@ export class View {
   // The rest of the file after the first picture, with time for others in between.
   async takeRest() {
     while (this.first === null && !document.hidden) await new Promise((resolve) => setTimeout(resolve, 4));
-    this.drawing.follow();
+    this.drawing.splat.follow();
     const { head } = this;
     try {
       for (let index = head.start; index < head.parts.length; index++) {

@@ -17,7 +17,7 @@ import numpy as np
 from gaussian_swaying._checks import first_line
 from gaussian_swaying._files import atomic, check_page, write_text
 from gaussian_swaying.gaussians.ply import check_folder
-from gaussian_swaying.player.film.recorded import STEPS, Film, read_film
+from gaussian_swaying.player.film.recorded import FIRST, PART, STEPS, Film, read_film
 
 PAGE = Path(__file__).parent / "page"
 RECORD = {
@@ -26,16 +26,12 @@ RECORD = {
     "turn": "<i2",
     "scale": "<f2",
     "growth": "u1",
-    "place": "<f4",
+    "arm": "<f4",
     "stencil": "<u4",
     "facing": "<i2",
 }
 """The numbers that are stored of a Gaussian, in this order; the last three only of those that move."""
-FIRST = {"moving": 1 << 11, "still": 1 << 12}
-"""Gaussians that move, and that do not, in the first picture."""
 KINDS = ("moving", "still")
-PART = 1 << 16
-"""Gaussians of a later part: whole rows of the player's textures, as in the first one."""
 GROUP = 32
 """Frames of a part."""
 MAGIC, VERSION = b"SWAY", 1
@@ -225,14 +221,13 @@ def pack(film: Film) -> dict[str, bytes]:
     far = [rows for _, rows in steps]
     near = np.array([frame for frame, _ in steps], np.int16).reshape(film.displacement.shape)
     frames: np.ndarray = np.diff(near.view(np.uint16), axis=0, prepend=np.uint16(0))
-    frames = frames << 1 ^ -(frames >> 15)  # the sign in the last bit, so that small numbers have a first byte of zero
     counts = np.array([len(rows) for rows in far], np.uint32)
     parts = parts_of(film.head)
     blocks = pack_head(film, parts)
     for index, (kind, first, last) in enumerate(parts):
         if kind == "frames":
             rows = np.concatenate(far[first:last])
-            block = _planes(frames[first:last]) + _planes(counts[first:last]) + _planes(rows)
+            block = planes(folded(frames[first:last])) + planes(counts[first:last]) + planes(rows)
         else:
             block = pack_splats(film, kind == "moving", first, last)
         blocks[f"part-{index}"] = block
@@ -244,7 +239,7 @@ def pack_head(film: Film, parts: list[list[Any]]) -> dict[str, bytes]:
     start = len({kind for kind, _, _ in parts})
     return {
         "head": json.dumps(film.head | {"parts": parts, "start": start}).encode(),
-        "stencils": _planes(film.stencils),
+        "stencils": planes(film.stencils),
     }
 
 
@@ -277,11 +272,11 @@ def unpack(blocks: dict[str, bytes]) -> Film:
         block, count = blocks[f"part-{index}"], end - begin
         if kind == "frames":
             size = 2 * count * 3 * head["nodes"]
-            frames = _unplaned(block[:size], np.dtype("<u2")).reshape(count, head["nodes"], 3)
+            frames = unplaned(block[:size], np.dtype("<u2")).reshape(count, head["nodes"], 3)
             frames = frames >> 1 ^ -(frames & 1)
             bits = np.cumsum(np.concatenate([last[None], frames]), axis=0, dtype=np.uint16)[1:]
-            counts = _unplaned(block[size : size + 4 * count], np.dtype("<u4"))
-            rows = _unplaned(block[size + 4 * count :], np.dtype("<i4")).reshape(-1, 4)
+            counts = unplaned(block[size : size + 4 * count], np.dtype("<u4"))
+            rows = unplaned(block[size + 4 * count :], np.dtype("<i4")).reshape(-1, 4)
             far = np.split(rows, np.cumsum(counts)[:-1])
             moved += [of_steps(*frame, head["step"]) for frame in zip(bits.view(np.int16), far, strict=True)]
             last = bits[-1]
@@ -298,7 +293,7 @@ def unpack(blocks: dict[str, bytes]) -> Film:
         owners = kinds if len(pieces) == len(kinds) else ["moving"] * len(pieces)
         ordered = [piece for kind in KINDS for piece, owner in zip(pieces, owners, strict=True) if owner == kind]
         fields[name] = np.concatenate(ordered)
-    stencils = _unplaned(blocks["stencils"], np.dtype("<u4")).reshape(-1, 27)
+    stencils = unplaned(blocks["stencils"], np.dtype("<u4")).reshape(-1, 27)
     return Film(
         head,
         **fields,
@@ -308,11 +303,20 @@ def unpack(blocks: dict[str, bytes]) -> Film:
     )
 
 
-def _planes(values: np.ndarray) -> bytes:
+def folded(values: np.ndarray) -> np.ndarray:
+    """Numbers of 16 bits with the sign in the last one, so that small ones have a first byte of zero, uint16."""
+    bits = values.view(np.uint16)
+    found: np.ndarray = bits << 1 ^ -(bits >> 15)
+    return found
+
+
+def planes(values: np.ndarray) -> bytes:
+    """The first bytes of all numbers, then the second bytes, and so on."""
     little = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
     return little.reshape(-1).view(np.uint8).reshape(-1, values.itemsize).T.tobytes()
 
 
-def _unplaned(block: bytes, kind: np.dtype) -> np.ndarray:
+def unplaned(block: bytes, kind: np.dtype) -> np.ndarray:
+    """The inverse of :func:`planes`, in one dimension."""
     planes = np.frombuffer(block, np.uint8).reshape(kind.itemsize, -1)
     return np.ascontiguousarray(planes.T).reshape(-1).view(kind)

@@ -24,8 +24,18 @@ from gaussian_swaying.simulation.body import SimulatedScene
 from gaussian_swaying.simulation.draw import Painter
 from gaussian_swaying.simulation.simulation import RecordedRun, Simulation
 
+FIRST = {"moving": 1 << 11, "still": 1 << 12}
+"""Gaussians that move, and that do not, in the first picture."""
+PART = 1 << 16
+"""Gaussians of a later part: whole rows of the player's textures, as in the first one."""
 STEPS = 1 << 15
 """Steps of a displacement in the longest side of the object at rest."""
+GRAIN = 1 << 19
+"""Steps of a position in it."""
+ARM = 1 << 12
+"""Steps of an arm in a cell. An error moves the place to and fro, but not the centre, in proportion to the gradient."""
+NORMAL = 512
+"""Steps of a normal."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +52,7 @@ class Film:
     Attributes:
         head: Further data for the page: sizes, time between frames [s], grid, light, camera, title.
         position: Centres at rest, float32, shape (N, 3).
-        place: Position at which those that move take displacement and gradient [cells], float32, shape (L, 3).
+        arm: Centre of those that move from where they take displacement and gradient [cells], float32, shape (L, 3).
         scale: Logarithm of the standard deviations, float16, shape (N, 3).
         turn: Quaternions wxyz in steps of 1/32767, int16, shape (N, 4).
         stencil: The number of the stencil of each of them, uint32, shape (L, 1).
@@ -58,7 +68,7 @@ class Film:
 
     head: dict[str, Any]
     position: np.ndarray
-    place: np.ndarray
+    arm: np.ndarray
     stencil: np.ndarray
     scale: np.ndarray
     turn: np.ndarray
@@ -69,6 +79,13 @@ class Film:
     stencils: np.ndarray
     displacement: np.ndarray
     notes: tuple[str, ...] = ()
+
+    @property
+    def place(self) -> np.ndarray:
+        """Position at which those that move take displacement and gradient [cells], float32, shape (L, 3)."""
+        centre = self.position[: len(self.arm)].astype(np.float64)
+        found: np.ndarray = ((centre - self.head["corner"]) / self.head["cell"] - self.arm).astype(np.float32)
+        return found
 
     def moved(self, frame: int) -> tuple[Tensor, Tensor]:
         """Centres and covariances in a frame, as the page draws them, without a limit of stretch.
@@ -132,7 +149,7 @@ def film_of(simulation: Simulation, grid: GridSpec, nodes: Tensor, displacement:
     camera = painter.camera_at(0)
     device = scene.model.means.device
     size, count = scene.size * scene.frame.metres_per_unit, len(scene.model.means)
-    position = scene.frame.point_to_sim(in_double(scene.model.means)) / size
+    position = (scene.frame.point_to_sim(in_double(scene.model.means)) / size * GRAIN).round() / GRAIN
     quats = torch.nn.functional.normalize(in_double(scene.model.quats.detach()), dim=-1)
     turn = quat_multiply(rotation_to_quat(in_double(scene.frame.rotation)).to(quats), quats)
     scale = in_double(scene.model.scales.detach()) + math.log(scene.frame.metres_per_unit / size)
@@ -165,14 +182,17 @@ def film_of(simulation: Simulation, grid: GridSpec, nodes: Tensor, displacement:
         "title": f"{name[:1].upper()}{name[1:]} in the wind",
     }
     doubled = order.to(position.device)  # where numbers in double precision live
+    position = position[doubled].float()
+    arm = (in_double(position[: len(moving)]) - position.new_tensor(head["corner"])) / head["cell"] - place[moving]
+    arm = (arm * ARM).round() / ARM
     return Film(
         head,
-        position[doubled].float().numpy(force=True),
-        place[moving].numpy(force=True),
+        position.numpy(force=True),
+        arm.float().numpy(force=True),
         stencil[moving, None].numpy(force=True).astype(np.uint32),
         scale[doubled].half().numpy(force=True),
         _steps(turn[doubled]),
-        _steps(facing),
+        _steps(facing, 32768 // NORMAL),
         (color[order].clamp(0, 1) * 255).round().to(torch.uint8).numpy(force=True),
         (growth(scene, camera)[order, None] * 255).round().to(torch.uint8).numpy(force=True),
         order.numpy(force=True),
@@ -190,8 +210,8 @@ def order_of(scene: SimulatedScene) -> tuple[Tensor, Tensor]:
     """
     means, moving = scene.model.means.detach(), scene.moving
     still = torch.ones(len(means), dtype=torch.bool, device=means.device).index_fill(0, moving, False).nonzero()[:, 0]
-    first = spread(means[moving])
-    return first, torch.cat([moving[first], still[spread(means[still])]])
+    first = spread(means[moving], FIRST["moving"])
+    return first, torch.cat([moving[first], still[spread(means[still], FIRST["still"])]])
 
 
 LAYERS = 2.0
@@ -237,11 +257,12 @@ _EVERY_THIRD_BIT = (
 """Shifts and masks that move bit k of a number of 20 bits to bit 3 k."""
 
 
-def spread(position: Tensor) -> Tensor:
+def spread(position: Tensor, first: int = 1) -> Tensor:
     """An order of places (N, 3) in which the first ones are spread over all of them, as indices (N,).
 
     Places are sorted along a Z-order curve and taken in the order of van der Corput's sequence: the second lies in the
-    middle, the third in the middle of the first half, and so on.
+    middle, the third in the middle of the first half, and so on. Those of a part, of which the first one has a length,
+    are in the order of the curve, as neighbours that are alike compress to less.
     """
     count = len(position)
     if count < 2:
@@ -256,7 +277,8 @@ def spread(position: Tensor) -> Tensor:
     mirrored = torch.zeros_like(rank)
     for bit in range(bits):
         mirrored |= (rank >> bit & 1) << (bits - 1 - bit)
-    return curve[mirrored[mirrored < count]]
+    parts = mirrored[mirrored < count].tensor_split([*range(first, count, PART)])
+    return curve[torch.cat([part.sort()[0] for part in parts])]
 
 
 def look_of(painter: Painter) -> dict[str, Any]:
@@ -277,22 +299,26 @@ def stencils_of(stencil: Stencil, grid: GridSpec, nodes: Tensor) -> tuple[Tensor
         nodes: Flat indices of the nodes that are known, rising, shape (M,).
 
     Returns:
-        The places in cells of the grid from its first node, float32, shape (N, 3); rounding leaves each in the cell of
-        its stencil, where it is ``floor(place - 0.5)``. The number of the stencil of each, shape (N,), and the rows of
-        the 27 nodes of each stencil in ``nodes``, shape (S, 27).
+        The places in cells of the grid from its first node, float64, shape (N, 3); rounding of arms leaves each in the
+        cell of its stencil, where it is ``floor(place - 0.5)``. The number of the stencil of each, shape (N,), and the
+        rows of the 27 nodes of each stencil in ``nodes``, shape (S, 27).
     """
     number = torch.unique(stencil.cell, return_inverse=True)[1]
     count = int(number.max()) + 1 if len(number) else 0
     example = number.new_zeros(count).index_copy(0, number, torch.arange(len(number), device=number.device))
-    low = coordinates(stencil.first, grid).float()
-    place = low + stencil.fraction.T
-    last = torch.nextafter(low + 1.5, low)
-    return place.float().clamp(low + 0.5, last), number, torch.searchsorted(nodes, stencil.node[example])
+    low = in_double(coordinates(stencil.first, grid))
+    place = low + in_double(stencil.fraction.T)
+    return (
+        place.clamp(low + 0.5 + 1 / ARM, low + 1.5 - 1 / ARM),
+        number,
+        torch.searchsorted(nodes, stencil.node[example]),
+    )
 
 
-def _steps(values: Tensor) -> np.ndarray:
-    """Numbers from -1 to 1 in steps of 1/32767."""
-    found: np.ndarray = (in_double(values).clamp(-1, 1) * 32767).round().to(torch.int16).numpy(force=True)
+def _steps(values: Tensor, grain: int = 1) -> np.ndarray:
+    """Numbers from -1 to 1 in steps of 1/32767, in whole grains of some but for the ends."""
+    steps = (in_double(values) * 32767 / grain).round() * grain
+    found: np.ndarray = steps.clamp(-32767, 32767).to(torch.int16).numpy(force=True)
     return found
 
 

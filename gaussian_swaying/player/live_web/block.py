@@ -1,8 +1,9 @@
 """The block of bytes that the solver in a browser needs, and the scenes that it cannot simulate.
 
 The block is the length of its head (uint32, little-endian), the head in JSON, and the arrays that the head lists, in
-float32 or whole numbers. The solvers are ``solver.js``, ``webgpu.js`` and ``modal.js`` in ``tools/player/live_web``;
-their definitions are :mod:`~gaussian_swaying.mpm.total` and :mod:`~gaussian_swaying.mpm.modes`.
+planes of float32 or whole numbers, those of 16 bits folded. The solvers are ``solver.js``, ``webgpu.js`` and
+``modal.js`` in ``tools/player/live_web``; their definitions are :mod:`~gaussian_swaying.mpm.total` and
+:mod:`~gaussian_swaying.mpm.modes`.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from gaussian_swaying.mpm.modes import LONGEST, PER_PERIOD, SHORTEST, Modes
 from gaussian_swaying.mpm.pins import PinnedPoints, PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.mpm.total import Total
-from gaussian_swaying.player.film.page import message
+from gaussian_swaying.player.film.page import folded, message, planes
 from gaussian_swaying.player.live_web.kernels import pack_modes, pack_total
 from gaussian_swaying.player.live_web.longest import longest_courant
 from gaussian_swaying.simulation.simulation import Simulation
@@ -156,5 +157,6 @@ def _joined(head: dict[str, Any], arrays: dict[str, Tensor]) -> bytes:
     for name, values in arrays.items():
         kind = "f4" if values.is_floating_point() else {torch.int8: "i1", torch.int16: "i2"}.get(values.dtype, "i4")
         listed.append([name, kind, values.numel()])
-        blocks.append(values.detach().cpu().contiguous().numpy().astype(np.dtype("<" + kind)).tobytes())
+        numbers = values.detach().cpu().contiguous().numpy().astype(np.dtype("<" + kind))
+        blocks.append(planes(folded(numbers) if kind == "i2" else numbers))
     return message(head | {"arrays": listed}, *blocks)

@@ -238,8 +238,9 @@ def _packed(
         tables[name] = loads.buffer[first : first + count]
         tables[name].zero_()  # a page is smaller with whole numbers
         unit = float(effect.table.abs().max()) / 64
-        small[name] = (effect.table / unit).round().char()
-        packed.append({"name": name, "table": name, "unit": unit})
+        values = (effect.table / unit).round().char()
+        small[name] = values.diff(dim=0, prepend=torch.zeros_like(values[:1]))
+        packed.append({"name": name, "table": name, "unit": unit, "row": values[0].numel()})
         at = effect.now(Moment(*torch.zeros(3, 1, 3, dtype=torch.float64)))[0, :3]
         cells = zip(effect.sizes.tolist(), effect.wraps, strict=True)
         carried.append(

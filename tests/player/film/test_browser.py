@@ -89,15 +89,15 @@ def test_the_film_is_the_run(show, film, run, moved):
     for frame in (0, 2, 5):
         page.evaluate(f"film.seek({frame})")
         assert page.evaluate("film.frame()") == frame
-        values = page.evaluate("film.positions().then((found) => Array.from(found))")
+        values = page.evaluate("film.view.positions().then((found) => Array.from(found))")
         assert longest(double(values).reshape(-1, 3) - moved[frame]) < 1e-4  # of the object's size
         pictures[frame] = _picture(page)
         assert _psnr(pictures[frame], iio.imread(run / f"frames/{frame:05d}.png")) > 45
     assert np.abs(pictures[0] - pictures[5]).max() > 50
     assert peak(moved[5] - moved[0]) > 0.02
-    before = page.evaluate("film.drawn()")
+    before = page.evaluate("film.view.drawn")
     page.evaluate("film.play()")
-    until(lambda: page.evaluate("film.drawn()") >= before + 5)
+    until(lambda: page.evaluate("film.view.drawn") >= before + 5)
     page.evaluate("film.pause()")
     assert page.told == asked_of_a_network(page) == []
 
@@ -211,7 +211,7 @@ def test_players_agree(name, served, example, moved, tmp_path):
     if name == "element":
         page = served(ELEMENT.format("flag.sway"))
         until(lambda: len(page.frames) == 2 and page.frames[1].evaluate("!!window.film"))
-        drawn = "async (frame) => { await film.seek(frame); return Array.from(await film.positions()); }"
+        drawn = "async (frame) => { await film.seek(frame); return Array.from(await film.view.positions()); }"
     else:
         page = example(name)
     film = read_bundle(tmp_path / "flag.sway")
@@ -302,7 +302,7 @@ def test_a_large_film_begins_with_some_of_its_gaussians_and_ends_as_the_same(sho
     )
     page.evaluate("film.seek(4)")
     assert page.evaluate("film.frame()") == 4
-    assert 0 < page.evaluate("film.first()") < 60
+    assert 0 < page.evaluate("film.view.first") < 60
     one = show(film)
     one.evaluate("film.seek(4)")
     assert np.array_equal(_picture(page), _picture(one))
@@ -324,7 +324,7 @@ def test_a_film_that_is_cut_short_says_so(show, large, tmp_path):
         place.filter(has_text=sentence).wait_for()
         assert page.locator("#message").is_visible() is not shown
         if shown:
-            page.wait_for_function("film.drawn() > 3")
+            page.wait_for_function("film.view.drawn > 3")
 
 
 @pytest.mark.slow

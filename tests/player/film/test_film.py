@@ -202,7 +202,7 @@ def test_a_large_film_comes_in_parts(run, monkeypatch):
     monkeypatch.setattr(film_page, "GROUP", 4)
     film = read_film(run)
     film.head["moving"] = 250  # as if the others stood still
-    film = replace(film, place=film.place[:250], stencil=film.stencil[:250], facing=film.facing[:250])
+    film = replace(film, arm=film.arm[:250], stencil=film.stencil[:250], facing=film.facing[:250])
     blocks = pack(film)
     head = json.loads(blocks["head"])
     assert head["start"] == 3

@@ -120,10 +120,10 @@ def opened(context, path, settings):
 
 def drawn_apart(page, simulation):
     """As :func:`apart`, of the Gaussians as a page draws them, read back from there; in sizes of the object."""
-    values = page.evaluate("windPage.positions().then((found) => Array.from(found))")
+    values = page.evaluate("windPage.tunnel.positions().then((found) => Array.from(found))")
     found = double(values).reshape(-1, 3)
     state = simulation.start()
-    for _ in range(round(page.evaluate("windPage.time() ?? 0") / simulation.frame_dt)):
+    for _ in range(round(page.evaluate("windPage.tunnel.playback.newest ?? 0") / simulation.frame_dt)):
         state, _ = simulation.advance(state)
     scene = simulation.scene
     size, order = scene.size * scene.frame.metres_per_unit, order_of(scene)[1]

@@ -28,11 +28,11 @@ def show(browser):
 def test_after_two_seconds_the_gaussians_are_where_a_run_puts_them(show, written, make):
     """Read back from the graphics card; within 1 % of the motion. Nothing is asked of a network."""
     page = show(written)
-    page.evaluate("windPage.complete.then(() => { windPage.pause(); windPage.reset(); })")
+    page.evaluate("windPage.complete.then(() => { windPage.tunnel.setPlaying(false); windPage.tunnel.reset(); })")
     told = page.evaluate("windPage.advance(50)")
     assert told["simulated"] == pytest.approx(2.0)
     assert told["kernels"]
-    assert page.evaluate("windPage.time() ?? 0") == pytest.approx(2.0)
+    assert page.evaluate("windPage.tunnel.playback.newest ?? 0") == pytest.approx(2.0)
     error, motion = drawn_apart(page, make())
     assert motion > 0.1
     assert error < 0.01
@@ -46,7 +46,7 @@ def _grabbed(page):
     page.mouse.move(300, 190)
     page.mouse.down()
     for _ in range(40):
-        if page.evaluate("windPage.pulled()"):
+        if page.evaluate("windPage.tunnel.pull?.held"):
             return True
         time.sleep(0.02)
     page.mouse.up()
@@ -55,11 +55,11 @@ def _grabbed(page):
 
 def _stops(page):
     """Wait until the motion stands still, and return its time."""
-    times = [page.evaluate("windPage.time() ?? 0")]
+    times = [page.evaluate("windPage.tunnel.playback.newest ?? 0")]
 
     def stands_still():
         time.sleep(0.2)
-        times.append(page.evaluate("windPage.time() ?? 0"))
+        times.append(page.evaluate("windPage.tunnel.playback.newest ?? 0"))
         return times[-1] == times[-2]
 
     until(stands_still)
@@ -72,32 +72,32 @@ def test_what_the_visitor_does(show, written):
     until(lambda: page.evaluate("windPage.value('stiffness')") == 2)
     assert page.evaluate("['wind', 'gusts'].map(windPage.value)") == [[0, 0, 0], 0]
     assert page.locator("#slow").get_attribute("aria-pressed") == "true"
-    link = page.evaluate("windPage.link()")
+    link = page.evaluate("windPage.tunnel.link()")
     until(lambda: _grabbed(page))
     page.mouse.move(310, 170)
     page.mouse.up()
-    assert not page.evaluate("windPage.pulled()")
-    assert page.evaluate("windPage.link()") == link  # the view stood still
+    assert not page.evaluate("windPage.tunnel.pull?.held")
+    assert page.evaluate("windPage.tunnel.link()") == link  # the view stood still
     page.locator("#slow").click()
-    until(lambda: page.evaluate("windPage.time() ?? 0") > 0.3)
+    until(lambda: page.evaluate("windPage.tunnel.playback.newest ?? 0") > 0.3)
     page.locator("#play").click()
-    assert not page.evaluate("windPage.playing()")
+    assert not page.evaluate("windPage.tunnel.playing")
     stopped = _stops(page)
     page.locator("#play").click()
-    until(lambda: page.evaluate("windPage.time() ?? 0") > stopped)
+    until(lambda: page.evaluate("windPage.tunnel.playback.newest ?? 0") > stopped)
     hide = "(value) => { Object.defineProperty(document, 'hidden', { value, configurable: true }); "
     hide += "document.dispatchEvent(new Event('visibilitychange')); }"
     page.evaluate(hide, True)
     stopped = _stops(page)
     page.evaluate(hide, False)
-    until(lambda: page.evaluate("windPage.time() ?? 0") > stopped)
+    until(lambda: page.evaluate("windPage.tunnel.playback.newest ?? 0") > stopped)
     box = page.locator("#dial").bounding_box()
     page.mouse.click(box["x"] + 0.9 * box["width"], box["y"] + 0.5 * box["height"])
     assert page.evaluate("Math.hypot(...windPage.value('wind'))") == pytest.approx(10 * 0.8 / 0.96, rel=0.05)
     for name, ends in {"gusts": (0, 3), "stiffness": (math.log10(0.125), math.log10(4))}.items():
         slider = page.locator(f"input[type=range][name={name}]")
         assert [float(slider.get_attribute(end)) for end in ("min", "max")] == pytest.approx(ends)
-    link = page.evaluate("windPage.link()")
+    link = page.evaluate("windPage.tunnel.link()")
     assert re.search(r"#wind=[-\d.,]+&gusts=0&stiffness=2&view=[-\d.,]+$", link)
 
     def turned():
@@ -105,7 +105,7 @@ def test_what_the_visitor_does(show, written):
         page.mouse.down()
         page.mouse.move(60, 60, steps=50)
         page.mouse.up()
-        return page.evaluate("windPage.link()") != link
+        return page.evaluate("windPage.tunnel.link()") != link
 
     until(turned)
     other = show(written, link[link.index("#") :])
@@ -115,7 +115,7 @@ def test_what_the_visitor_does(show, written):
         assert known[0] == pytest.approx(known[1], abs=1e-3)
     page.locator("#play").click()  # or its first moments pass between two looks
     page.locator("#reset").click()
-    until(lambda: page.evaluate("windPage.time() ?? 1") < 0.3)
+    until(lambda: page.evaluate("windPage.tunnel.playback.newest ?? 1") < 0.3)
     assert page.told == other.told == []
 
 
@@ -125,7 +125,7 @@ def test_a_page_that_falls_behind_slows_time_and_says_so(show, make, tmp_path):
     page.locator("#note").filter(has_text="too slow for real time").wait_for(timeout=60_000)
     told = page.locator("#note").inner_text()
     assert re.fullmatch(r"This device is too slow for real time: the motion runs at 0\.\d\d of it\.", told)
-    assert page.evaluate("windPage.playing()")
+    assert page.evaluate("windPage.tunnel.playing")
 
 
 def test_a_file_that_is_cut_short_or_damaged_says_so(show, written, tmp_path):
@@ -162,7 +162,7 @@ def test_a_page_within_another_page(browser, written):
     until(lambda: len(page.frames) == 2 and page.frames[1].evaluate("!!window.windPage"))
     inner = page.frames[1]
     until(lambda: inner.evaluate("windPage.value('wind')") == [1, 2, 0])
-    assert re.search(r"&?view=0,-3,0,0,0,0$", inner.evaluate("windPage.link()"))
+    assert re.search(r"&?view=0,-3,0,0,0,0$", inner.evaluate("windPage.tunnel.link()"))
     page.evaluate("document.querySelector('gaussian-swaying').setAttribute('wind', '-3,0,0')")
     until(lambda: inner.evaluate("windPage.value('wind')[0]") == -3)
     page.close()

@@ -93,6 +93,7 @@ MIXED = {
     "linear, semi-implicit": CASES["linear, semi-implicit"],
     "one patch, cross flow": CASES["one patch, cross flow"],
     "bending": CASES["bending"],
+    "turbulence": CASES["effects"],
 }
 
 
@@ -111,40 +112,40 @@ def test_laws_forces_and_boundaries(make, on_gpu, name):
 def test_a_page_after_two_seconds_and_after_its_device_is_lost(show, written, make):
     """Within 1 % of the motion. Then the processor goes on with the motion, and the page says so."""
     page = show(written, "#solver=webgpu")
-    page.evaluate("windPage.complete.then(() => windPage.pause())")
-    until(lambda: page.evaluate("windPage.solver()") == "webgpu")
-    page.evaluate("windPage.reset()")
+    page.evaluate("windPage.complete.then(() => windPage.tunnel.setPlaying(false))")
+    until(lambda: page.evaluate("windPage.state.solver") == "webgpu")
+    page.evaluate("windPage.tunnel.reset()")
     assert page.evaluate("windPage.advance(50)")["gpu"]
     error, motion = drawn_apart(page, make())
     assert motion > 0.1
     assert error < 0.01
     assert not page.locator("#note").is_visible()
-    page.evaluate("windPage.lose()")
+    page.evaluate("windPage.say({ kind: 'lose' })")
     told = page.evaluate("windPage.advance(10)")
     assert told["kernels"]
-    assert page.evaluate("windPage.solver()") == "webassembly"
-    assert page.evaluate("windPage.time() ?? 0") == pytest.approx(2.4)
+    assert page.evaluate("windPage.state.solver") == "webassembly"
+    assert page.evaluate("windPage.tunnel.playback.newest ?? 0") == pytest.approx(2.4)
     assert drawn_apart(page, make())[0] < 0.01
-    assert page.locator("#note").inner_text() == LOST.format(page.evaluate("windPage.why()"))
+    assert page.locator("#note").inner_text() == LOST.format(page.evaluate("windPage.state.why"))
     assert asked_of_a_network(page) == []
 
 
 def test_chosen_by_hand(show, written):
     """By itself a page takes no adapter in software, and says nothing; another solver goes on with the motion."""
     page = show(written, "")
-    until(lambda: page.evaluate("windPage.why()") == "it would run on the processor")
-    assert page.evaluate("windPage.solver()") == "webassembly"
+    until(lambda: page.evaluate("windPage.state.why") == "it would run on the processor")
+    assert page.evaluate("windPage.state.solver") == "webassembly"
     assert not page.locator("#note").is_visible()
     for name, solver in {"webgpu": "webgpu", "worker": "webassembly"}.items():
-        before = page.evaluate("windPage.time() ?? 0")
+        before = page.evaluate("windPage.tunnel.playback.newest ?? 0")
         page.evaluate(f"location.hash = 'solver={name}'")
-        until(lambda solver=solver: page.evaluate("windPage.solver()") == solver)
-        until(lambda before=before: page.evaluate("windPage.time() ?? 0") > before)
-        assert f"solver={name}" in page.evaluate("windPage.link()")
+        until(lambda solver=solver: page.evaluate("windPage.state.solver") == solver)
+        until(lambda before=before: page.evaluate("windPage.tunnel.playback.newest ?? 0") > before)
+        assert f"solver={name}" in page.evaluate("windPage.tunnel.link()")
     assert page.told == []
     page = show(written, "#solver=worker")
-    until(lambda: page.evaluate("windPage.time() ?? 0") > 0)
-    assert [page.evaluate("windPage.solver()"), page.evaluate("windPage.why()")] == ["webassembly", None]
+    until(lambda: page.evaluate("windPage.tunnel.playback.newest ?? 0") > 0)
+    assert [page.evaluate("windPage.state.solver"), page.evaluate("windPage.state.why")] == ["webassembly", None]
 
 
 BROKEN = "GPUDevice.prototype.createComputePipelineAsync = () => Promise.reject(new Error('no pipeline'));"

@@ -1,6 +1,8 @@
 // Reads the block that player/live_web/block.py packs: the length of its head, the head, and its arrays.
 
-const WHOLE = { i1: Int8Array, i2: Int16Array, i4: Int32Array };
+import { reader, unfold } from "../bundle.js";
+
+const KINDS = { i1: Int8Array, i2: Uint16Array, i4: Int32Array, f4: Float32Array };
 
 /**
  * @param {Uint8Array} bytes
@@ -15,9 +17,10 @@ export function readBlock(bytes) {
   const arrays = {};
   for (const [name, kind, count] of head.arrays) {
     const length = Number(kind[1]) * count;
-    const part = bytes.slice(at, at + length).buffer;
-    if (part.byteLength !== length) throw new Error("the block of the solver is too short");
-    arrays[name] = kind === "f4" ? Float64Array.from(new Float32Array(part)) : new WHOLE[kind](part);
+    const part = bytes.subarray(at, at + length);
+    if (part.length !== length) throw new Error("the block of the solver is too short");
+    const values = reader(part)(KINDS[kind], count);
+    arrays[name] = kind === "f4" ? Float64Array.from(values) : kind === "i2" ? Int16Array.from(values, unfold) : values;
     at += length;
   }
   return { head, arrays };

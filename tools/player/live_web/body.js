@@ -26,7 +26,12 @@ export class Body {
     /** @type {Record<string, any>} */
     this.tables = {};
     for (const [name, [first, count, kind]] of Object.entries(places)) this.tables[name] = new KINDS[kind](memory.buffer, first, count);
-    for (const { name, table, unit } of head.packed) this.tables[table].set(Float32Array.from(arrays[name], (x) => unit * x));
+    for (const { name, table, unit, row } of head.packed) {
+      const values = arrays[name]; // differences to the row before
+      for (let i = row; i < values.length; i++) values[i] += values[i - row];
+      this.tables[table].set(Float32Array.from(values, (x) => unit * x));
+    }
+    arrays.image = new Uint8Array(memory.buffer, start, image.length); // with them, for a graphics card
     this.wind = new Wind(head.wind, this.kernels, this.tables);
     /** Computes substeps in place of this processor. @type {import("./webgpu.js").Gpu | null} */
     this.gpu = null;

@@ -112,25 +112,14 @@ export async function sway(read, tell) {
     view,
     complete,
     value: (name) => tunnel.panel.controls.get(name).value,
-    link: () => tunnel.link(),
-    first: () => view.first,
-    time: () => tunnel.playback.newest,
-    rate: () => state.rate,
-    solver: () => state.solver, // webgpu, webassembly or javascript
-    why: () => state.why, // it is not WebGPU
-    // As if the graphics card were lost.
-    lose: () => say({ kind: "lose" }),
-    playing: () => tunnel.playing,
-    pulled: () => tunnel.pull?.held ?? false,
-    pause: () => tunnel.setPlaying(false),
-    reset: () => tunnel.reset(),
+    state, // what computes, webgpu or webassembly, and why it is not WebGPU
+    say,
     // Advance by some frames at once, without the clock; resolves with how long that took.
     advance: (count, hurried = false) =>
       new Promise((resolve) => {
         answers.push(resolve);
         say({ kind: "frames", count, hurried });
       }),
-    positions: () => tunnel.positions(),
   };
   await start;
 }
