@@ -28,7 +28,7 @@ class Solver(nn.Module, ABC):
     """Base class of solvers: what a :class:`~gaussian_swaying.simulation.simulation.Simulation` needs of one.
 
     A solver takes material points at rest and advances a :class:`~gaussian_swaying.mpm.state.State` under forces. The
-    Gaussians follow the points. Only four methods have to be written; examples/mass_spring_cloth.py is a whole one.
+    Gaussians follow the points. Only four methods have to be written; examples/python/own_solver.py is a whole one.
 
     Attributes:
         formulation: Its name in the summary of a run.

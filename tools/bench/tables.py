@@ -11,6 +11,7 @@ from bench.known import KNOWN, plain
 from bench.report import SECTIONS, grid, reached, source, table
 from bench.runner import read
 from gaussian_swaying.mpm.materials import MATERIALS
+from gaussian_swaying.simulation.model import names, number
 
 DASH = "-"
 
@@ -36,6 +37,19 @@ def _materials() -> str:
 
 
 SECTIONS["materials.known"] = _materials
+
+
+def _live() -> str:
+    kinds = {"vector": "three numbers", "whole": "a whole number"}
+    rows = (
+        f"`{name}` | {one.unit} | {kinds.get(one.kind, one.range_in_words)} | {'yes' * one.batched} "
+        f"| {'yes' * one.differentiable}"
+        for name, one in ((name, number(name)) for name in names())
+    )
+    return grid("name | unit | range | together in a batch | keeps a gradient", rows)
+
+
+SECTIONS["numbers"] = _live
 
 # ---- speed.md
 

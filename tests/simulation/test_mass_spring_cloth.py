@@ -19,7 +19,7 @@ from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.simulation.model import Edit
 
 BOX = {"min": [None, None, None], "max": [0.11, None, None]}
-FILE = Path(__file__).parents[2] / "examples" / "mass_spring_cloth.py"
+FILE = Path(__file__).parents[1] / "mass_spring_cloth.py"
 
 
 @pytest.fixture(scope="module")

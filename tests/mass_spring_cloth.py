@@ -1,10 +1,5 @@
-"""A solver of your own: a cloth of masses and springs moves a splat in the wind.
+"""A solver that the package does not know: a cloth of masses and springs moves a splat in the wind."""
 
-``python examples/mass_spring_cloth.py`` records a flag with it and with the material point method, and prints how far
-apart they end. Everything but the solver is the package's: sampling, wind, pins, pictures, files, live page.
-"""
-
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -168,7 +163,3 @@ def main(output: Path, frames: int = 25) -> float:
     apart = float((places[0][1] - places[1][1]).norm(dim=-1).mean() / way)
     print(f"The cloth of springs ends {apart:.0%} of the way from the material points.")
     return apart
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "outputs/mass_spring_cloth"))
