@@ -155,9 +155,14 @@ export class View {
     } else if (gl.getSyncParameter(this.fence, gl.SYNC_STATUS) === gl.SIGNALED) this.first = performance.now() / 1000;
   }
 
+  // Resolves with the first picture, or at once in a hidden page.
+  async begun() {
+    while (this.first === null && !document.hidden) await new Promise((resolve) => setTimeout(resolve, 4));
+  }
+
   // The rest of the file after the first picture, with time for others in between.
   async takeRest() {
-    while (this.first === null && !document.hidden) await new Promise((resolve) => setTimeout(resolve, 4));
+    await this.begun();
     this.drawing.splat.follow();
     const { head } = this;
     try {

@@ -118,9 +118,7 @@ EMBEDDED = "<script>\n{loader}\nloadPage({options});\n</script>"
 SERVED = '<script src="player.js"></script>\n<script>{start}</script>'
 STARTS = {
     "film": EMBEDDED.replace("{options}", "{ what: 'film', early: ['part-0', 'part-1', 'part-2'], play: 'playFilm' }"),
-    "page": EMBEDDED.replace(
-        "{options}", "{ what: 'page', early: ['worker', 'solver', 'part-0'], play: 'swayInWind' }"
-    ),
+    "page": EMBEDDED.replace("{options}", "{ what: 'page', early: ['worker', 'part-0'], play: 'swayInWind' }"),
     "live": SERVED.replace("{start}", "watchWind();"),
     "file": SERVED.replace("{start}", "playFile(new URLSearchParams(location.search).get('src'));"),
 }

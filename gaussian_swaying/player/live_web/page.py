@@ -53,6 +53,6 @@ def write_live_web(simulation: Simulation, name: str, target: Path) -> Film:
     ]  # fmt: skip
     code = {name: (folder / f"{name}.min.js").read_bytes() for name, folder in (("film", FILM_PAGE), ("worker", PAGE))}
     packed = pack(film)
-    blocks = {"code": code["film"], "head": packed.pop("head"), "stencils": packed.pop("stencils")}
+    blocks = {"code": code["film"]} | {name: packed.pop(name) for name in ("head", "stencils", "part-0")}
     write_text(target, filled("page", film.head, blocks | {"worker": code["worker"], "solver": solver} | packed))
     return film

@@ -23,7 +23,8 @@ export async function sway(read, tell) {
   const view = new View(element("canvas"));
   const worker = startWorker(await read("worker"));
   const state = { failed: null, rate: null, message: "", solver: "", why: null };
-  const say = (/** @type {any} */ message, /** @type {Transferable[]} */ given = []) => worker.postMessage(message, given);
+  let waiting = /** @type {any[] | null} */ ([]); // messages, until the solver is loaded
+  const say = (/** @type {any} */ message) => (waiting ? waiting.push(message) : worker.postMessage(message));
   const answers = []; // promises of tests, see `advance`
   let wish = ""; // webgpu, worker or auto: where the link wants it to be computed
 
@@ -86,13 +87,16 @@ export async function sway(read, tell) {
     tell(sentence);
   }
 
-  const block = await read("solver");
-  say({ kind: "load", bytes: block }, [block.buffer]);
   await view.open(head, stencils, read);
   view.aimAsWritten();
   tunnel.show(head.panel);
   document.addEventListener("visibilitychange", () => tunnel.run()); // a hidden page costs nothing
   view.begin((now) => tunnel.tick(now));
+  await view.begun();
+  const block = await read("solver");
+  worker.postMessage({ kind: "load", bytes: block }, [block.buffer]);
+  for (const message of waiting) worker.postMessage(message);
+  waiting = null;
   const complete = view.takeRest();
   const begin = () => {
     tunnel.apply(location.hash);
