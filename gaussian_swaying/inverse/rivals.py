@@ -11,9 +11,6 @@ from torch import Tensor
 from gaussian_swaying.inverse.unknowns import Unknown, Values, turn, values_at
 from gaussian_swaying.simulation.model import Model, flow_of
 
-SHAKEN = 0.12
-"""Change of what is sought of the material, as a share of the range."""
-
 FLAT = 0.8
 """Part of the area that faces one way, level with the ground, from which the wind may be mirrored: a mean square."""
 
@@ -24,20 +21,14 @@ TURN, MIRROR = 5.0, 20.0
 """Least angle between the wind and its mirror image, and largest between that and another end [degrees]."""
 
 
-def rivals_of(model: Model, unknowns: Sequence[Unknown], place: Sequence[float]) -> list[list[float]]:
-    """Places from which to start again at the end of a fit, as shares of the ranges, within them.
-
-    For each number of the material a smaller and a larger one, then the mirrored wind if there is one.
-    """
-    found, last = [], []
+def mirrored_place(model: Model, unknowns: Sequence[Unknown], place: Sequence[float]) -> list[list[float]]:
+    """The place with the mirrored wind, as shares of the ranges; none if there is none within them."""
     for k, unknown in enumerate(unknowns):
-        for side in (-SHAKEN, SHAKEN) if unknown.name.startswith("material.") else ():
-            found.append([*place[:k], min(max(place[k] + side, 0.0), 1.0), *place[k + 1 :]])
         if unknown.name == "wind.azimuth" and (azimuth := mirrored(model, values_at(unknowns, place))) is not None:
             middle = 0.5 * (unknown.low + unknown.high)
             share = unknown.share(middle + turn(azimuth - middle))
-            last += [[*place[:k], share, *place[k + 1 :]]] if 0 <= share <= 1 else []
-    return found + last
+            return [[*place[:k], share, *place[k + 1 :]]] if 0 <= share <= 1 else []
+    return []
 
 
 def bent_alike(unknowns: Sequence[Unknown], place: Tensor) -> Tensor:
