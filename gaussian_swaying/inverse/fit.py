@@ -57,7 +57,7 @@ from gaussian_swaying.inverse.report import (
     write_page,
     write_results,
 )
-from gaussian_swaying.inverse.rivals import bent_alike, is_mirrored, mirrored_place
+from gaussian_swaying.inverse.rivals import is_mirrored, mirrored_place
 from gaussian_swaying.inverse.tracks import Tracks, beside_rest, match, opencv, still_until, track
 from gaussian_swaying.inverse.unknowns import (
     FILM_START,
@@ -357,8 +357,7 @@ class Problem:
         """Return the best starts of a coarse search: Sobol's sequence over the ranges, then draws around the best.
 
         Coefficients and damping stay in the middle of their ranges, and what has a ``start`` stays there, but for
-        :data:`SPREAD`. Then other stiffnesses are tried that bend as far as the best. Values that were given are the
-        first start. Simulations of similar stiffness are one batch.
+        :data:`SPREAD`. Values that were given are the first start. Simulations of similar stiffness are one batch.
         """
         unknowns, plan = self.plan.unknowns, self.plan
         begin = torch.tensor([[0.5 if u.start is None else u.share(u.start) for u in unknowns]], dtype=torch.float64)
@@ -376,19 +375,14 @@ class Problem:
         shape = plan.search - 3 * plan.search // 4, len(free)
         shift = NEAR * torch.randn(shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
-        def near(best: Tensor) -> Tensor:
-            found = best.repeat(len(shift), 1)
-            found[:, free] = (found[:, free] + shift).clamp(0.02, 0.98)
-            return found
-
         evidence, times = self.evidence("tracks"), self._until(SEARCHED)
-        with self.say.work("search", (given + plan.search + 16) * len(times)):
+        with self.say.work("search", (given + plan.search) * len(times)):
             places, costs = self._coarse(torch.cat([begin[: int(given)], places]), evidence, times)
-            for others in (lambda best: bent_alike(unknowns, best), near):
-                other = others(places[int(costs.argmin())])
-                if len(other):
-                    tried = self._coarse(other, evidence, times)
-                    places, costs = torch.cat([places, tried[0]]), torch.cat([costs, tried[1]])
+            if len(shift):
+                near = places[int(costs.argmin())].repeat(len(shift), 1)
+                near[:, free] = (near[:, free] + shift).clamp(0.02, 0.98)
+                near, more = self._coarse(near, evidence, times)
+                places, costs = torch.cat([places, near]), torch.cat([costs, more])
         if not bool(torch.isfinite(costs).any()):
             raise DivergedError("Every simulation of the coarse search diverged: narrow the ranges of `unknowns`.")
         found = places[:1].tolist() if given else []
@@ -496,7 +490,7 @@ class Problem:
             begin = time.monotonic()
             for _ in states_of(self.simulation, [self.values(middle)] * batch, times):
                 pass
-        count = SEARCHED * (self.plan.search + 16) + 3 * batch * sum(share for _, share in STEPS)
+        count = SEARCHED * self.plan.search + 3 * batch * sum(share for _, share in STEPS)
         count += BRIEF * batch * (STARTS + 3) + REFINED * batch * len(GRIDS)
         seconds = count * (time.monotonic() - begin) / batch
         told = f"about {count:.0f} simulations of {self.fitted[-1]:.3g} s: some {duration(seconds)}"
