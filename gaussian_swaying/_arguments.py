@@ -35,10 +35,7 @@ def check_arguments(
     """Raise TypeError unless arguments have the types of a function's annotations; ValueError for an unknown word.
 
     Args:
-        function: The function.
-        given: Its arguments by name; others are ignored.
         where: Its name in the message, or what comes before that of an argument, as in ``material.``.
-        wider: Types in place of annotations.
     """
     for name, kind in (_hints(function) | dict(wider or {})).items():
         if name in given and not _fits(given[name], kind):

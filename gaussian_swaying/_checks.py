@@ -31,7 +31,6 @@ def check_shape(name: str, tensor: Tensor, *shape: int | str | None, batches: bo
         name: Name of the argument, for the message.
         tensor: Tensor to check.
         shape: Expected trailing sizes; a letter or None stands for any size.
-        batches: Whether leading batch dimensions are allowed.
     """
     if not isinstance(tensor, Tensor):
         raise TypeError(f"Expected `{name}` to be a torch.Tensor, but got {type(tensor).__name__}.")
@@ -55,7 +54,7 @@ def check_plain(name: str, value: Any) -> None:
     if any(map(requires_grad, items)):
         raise ValueError(
             f"Expected `{name}` without a gradient, which would be lost: give plain numbers (`tensor.detach()`); "
-            "docs/python.md lists what keeps its gradient."
+            "docs/configuration.md lists what keeps its gradient."
         )
 
 
@@ -83,13 +82,7 @@ def check_vector(name: str, value: Any, length: int = 3) -> tuple[float, ...]:
 
 
 def check_sense(name: str, value: float, least: float = 1e-12) -> None:
-    """Raise ValueError unless a finite number lies in the range in which a setting of its name makes sense.
-
-    Args:
-        name: The name.
-        value: Its value; zero is left to other checks.
-        least: Smallest size where the name is not known.
-    """
+    """Raise ValueError unless a finite number lies in the range in which a setting of its name makes sense."""
     sense = sense_of(name)
     known = sense or Sense(low=least)
     if value and not known.low <= (value if sense else abs(value)) <= known.high:

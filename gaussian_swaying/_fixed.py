@@ -34,7 +34,6 @@ class Fixed:
     """Base of settings: once an object is made, its public names cannot be assigned.
 
     Attributes:
-        assignable: Names that can.
         live_as: Where a simulation has it, for example ``wind``.
         of_a_file: Whether its annotations are what a file can say, and Python more.
     """

@@ -12,11 +12,6 @@ from typing import Any
 def classes_of(folder: str, path: Iterable[str], base: type) -> dict[str, Any]:
     """Import every file of a folder and find the classes that are defined there.
 
-    Args:
-        folder: ``__name__`` of the package that the folder is.
-        path: ``__path__`` of that package.
-        base: Base class.
-
     Returns:
         The subclasses of ``base`` that are not abstract, by name. Subfolders are skipped.
     """

@@ -27,7 +27,6 @@ def check_regular(path: str | os.PathLike[str], what: str = "the file", largest:
     """Return a path if it is a regular file, and not a folder, or a device or pipe that may never end.
 
     Args:
-        path: The path.
         what: Name of the kind of file, for the message.
         largest: Largest allowed size [bytes].
     """
@@ -52,7 +51,6 @@ def read_json(path: str | os.PathLike[str], what: str, largest: int = LARGEST_JS
     """Read a JSON file.
 
     Args:
-        path: The file.
         what: Name of the file in the message, for example "camera file".
         largest: Largest allowed size [bytes].
 
@@ -78,8 +76,6 @@ def parse_json(content: bytes, what: str, path: str | os.PathLike[str]) -> Any:
     """Parse JSON from a file or a part of one.
 
     Args:
-        content: The JSON.
-        what: Name of the file in the message.
         path: The file, for the message.
     """
     entries = sum(map(content.count, (b",", b"[", b"{")))
@@ -101,7 +97,6 @@ def check_archive(path: str | os.PathLike[str], what: str) -> Path:
     """Return a path if it is a .npz file whose arrays take no more than a gigabyte plus ten times its size.
 
     Args:
-        path: The path.
         what: Name of the kind of file, for the message.
     """
     path = check_regular(path, what)
@@ -129,7 +124,6 @@ def check_unpacked(path: Path, needed: int, what: str, size: int | None = None) 
     """Check what a compressed file announces before it is decompressed.
 
     Args:
-        path: The file.
         needed: Memory that reading it takes at the most [bytes].
         what: The announced content, for the message, for example "a `count` of 8,000 Gaussians".
         size: Size of all files that hold it [bytes]; that of the file if None.
@@ -147,10 +141,7 @@ def read_arrays(
     """Read arrays from a .npz file; no code in it is executed.
 
     Args:
-        path: The file.
         what: Name of the kind of file, for the message, for example "the reference".
-        needed: Names of the required arrays.
-        optional: Names of optional arrays.
         only: Whether others are an error.
 
     Returns:

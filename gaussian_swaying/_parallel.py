@@ -21,9 +21,7 @@ def in_threads(work: Callable[..., ResultT], *arguments: Iterable[object], threa
     Each thread runs the operations of torch alone, with the gradients and the inference mode of the caller.
 
     Args:
-        work: The function.
         arguments: Its arguments, one iterable for each.
-        threads: Number of threads; with one, the caller does the work, with all threads of torch.
     """
     if threads <= 1:
         yield from map(work, *arguments)

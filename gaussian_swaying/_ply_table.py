@@ -26,7 +26,6 @@ class PlyElement:
 
     Attributes:
         name: Its name, such as ``vertex``.
-        count: Number of rows.
         fields: Name and numpy type of each property; None as the type of a list.
     """
 
@@ -60,11 +59,7 @@ class PlyHeader:
 
 
 def read_header(path: str | os.PathLike[str]) -> PlyHeader:
-    """Read the header of a .ply file, and compare its number of rows with the size of the file.
-
-    Args:
-        path: The file.
-    """
+    """Read the header of a .ply file, and compare its number of rows with the size of the file."""
     path = check_regular(path, "the .ply file")
     with path.open("rb") as stream:
         head = stream.read(LARGEST_HEADER)
@@ -102,11 +97,6 @@ def read_header(path: str | os.PathLike[str]) -> PlyHeader:
 
 def read_element(path: str | os.PathLike[str], header: PlyHeader, name: str) -> np.ndarray:
     """Read one element of a binary .ply file, and nothing else.
-
-    Args:
-        path: The file.
-        header: Its header, from :func:`read_header`.
-        name: Name of the element.
 
     Returns:
         Structured array with a field for each property, shape (rows,).

@@ -18,9 +18,6 @@ def called(command: str) -> None:
 def words(command: str) -> list[str]:
     """The words that start a command.
 
-    Args:
-        command: ``sim``, ``train``, ``preview``, ...
-
     Example:
         >>> words("sim")
         ['python', 'tools/sim.py']
@@ -30,9 +27,6 @@ def words(command: str) -> list[str]:
 
 def command(*given: object) -> str:
     """A command line, quoted for a shell.
-
-    Args:
-        given: The command, and its arguments.
 
     Example:
         >>> command("sim", "--config", "my scan/#1.yaml")

@@ -65,9 +65,7 @@ def read_fields(
     """Read a YAML file with known fields at the top; any of them may be missing.
 
     Args:
-        path: The file.
         what: Name of the kind of file, for the message, for example "the sweep file".
-        fields: Names that it may have.
         change: Returns what was read, or refuses it.
 
     Returns:

@@ -426,7 +426,6 @@ class LatticeFlow(nn.Module):
         """Force of the air on some wall cells in the next step [N], shape (3,), float64: the momentum of what returns.
 
         Args:
-            state: The state now.
             part: The wall cells, bool, shape (X, Y, Z), away from the faces: the pressure at rest is left out, which
                 pushes a closed surface nowhere.
         """
@@ -448,7 +447,6 @@ class LatticeFlow(nn.Module):
         """Advance by one time step.
 
         Args:
-            state: The state now.
             wind: Velocity [m/s] at the cells of open faces, shape (3,) or (H, 3); still if None.
             acceleration: Of all the air [m/s²].
         """

@@ -172,8 +172,6 @@ def give(moments: Tensor, taken: Tensor, place: Tensor, kind: Tensor) -> None:
     Args:
         moments: Of the flow, shape (10, X, Y, Z).
         taken: What the points take, in units of the air in a cell at one cell per step, shape (P, 3).
-        place: See :func:`look`.
-        kind: See :func:`look`.
     """
     programs, options = _scatter(place)
     launch(subtract, (programs,))(
@@ -205,8 +203,6 @@ def exchange(moments: Tensor, velocity: Tensor, area: Tensor, mass: Tensor, plac
         velocity: Of the points [cells per step], shape (P, 3).
         area: Their area in faces of a cell, shape (P,).
         mass: Their mass in units of the air in a cell, shape (P,); infinite for still ones is given as a large number.
-        place: See :func:`look`.
-        kind: See :func:`look`.
 
     Returns:
         Momentum in units of the air in a cell at one cell per step, shape (P, 3).

@@ -22,7 +22,6 @@ def places_in_picture(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
 
     Args:
         points: Points [scene units], on the CPU, shape (N, 3).
-        camera: The camera.
 
     Returns:
         Column and row of each [pixels], shape (N, 2), and which are in the picture, shape (N,).
@@ -54,7 +53,6 @@ def turned_as_points(
     """Whether photos agree better with the colours of points if they are turned as their EXIF tags say.
 
     Args:
-        cameras: The cameras of the photos.
         load: Reads the photo of an index as it is stored, or turned: dtype uint8, shape (H, W, 3 or 4).
         points: Points of the capture [scene units], shape (P, 3).
         colors: Their colours in 0 to 1, shape (P, 3).

@@ -285,9 +285,6 @@ def _turned(views: Sequence[View], unsure: Sequence[int], points: PointCloud | N
 def nearest_to_axes(cameras: Sequence[Camera]) -> Tensor:
     """The point with the smallest sum of squared distances to all optical axes.
 
-    Args:
-        cameras: At least one camera.
-
     Returns:
         The point [scene units], float64, shape (3,); NaN if the axes are parallel.
     """
@@ -309,9 +306,6 @@ def axes_meet_behind(cameras: Sequence[Camera]) -> bool:
 
 def common_focus(cameras: Sequence[Camera]) -> Tensor | None:
     """The point nearest to all optical axes, if it is in front of most cameras.
-
-    Args:
-        cameras: At least one camera.
 
     Returns:
         The point [scene units], float64, shape (3,); None if they look at no common point.
@@ -406,7 +400,6 @@ def neighbouring_views(cameras: Sequence[Camera], count: int = 8, largest_angle:
     larger one the picture looks different. A view from the same place tells nothing of depth and is left out.
 
     Args:
-        cameras: The cameras of a capture, on any device.
         count: Most views for each.
         largest_angle: Largest angle between the axes of two views [degrees].
 

@@ -62,10 +62,6 @@ def _has(folder: Path, name: str) -> bool:
 def read_colmap_points(model: Path, origin: Origin = NO_ORIGIN) -> PointCloud | None:
     """Read ``points3D`` of a model.
 
-    Args:
-        model: Folder of the model.
-        origin: Point of the model from which they count.
-
     Returns:
         The points; None if there are none.
     """
@@ -81,9 +77,6 @@ def read_colmap_points(model: Path, origin: Origin = NO_ORIGIN) -> PointCloud | 
 
 def read_colmap_views(model: Path) -> list[tuple[str, Lens, Tensor]]:
     """Read only the cameras of a sparse model; the images need not exist.
-
-    Args:
-        model: Folder of the model.
 
     Returns:
         Name, lens and world-to-camera matrix (float64, shape (4, 4)) of each image, in the order of the file.

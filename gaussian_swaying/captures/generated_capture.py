@@ -145,9 +145,6 @@ class GeneratedCapture:
     def render(self, camera: Camera) -> Tensor:
         """Draw the sheet by ray casting.
 
-        Args:
-            camera: Any pinhole camera.
-
         Returns:
             Colours in 0 to 1, multiplied with alpha, and alpha, each averaged over the pixel, shape (H, W, 4).
         """
@@ -212,7 +209,6 @@ class GeneratedCapture:
 
         Args:
             folder: Folder to write, new or empty.
-            threads: Number of images drawn at a time.
 
         Returns:
             The folder.

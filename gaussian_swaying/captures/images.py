@@ -72,7 +72,6 @@ def read_image(path: str | Path, turned: bool = False) -> Tensor:
     """Read an image of 8 or 16 bits, grey or colour, with or without alpha.
 
     Args:
-        path: File in any format that Pillow reads; the first picture of an animation.
         turned: Whether to turn the pixels as the EXIF tag says, as viewers do, and most tools for camera poses do not.
 
     Returns:
@@ -131,11 +130,8 @@ def load_image(
     Colours are premultiplied with alpha first, so that transparent pixels do not bleed into others.
 
     Args:
-        path: The file.
-        lens: Its lens.
         downscale: Each pixel of the result is the mean of a square of this many pixels on a side.
         turned: Whether to turn the pixels as the EXIF tag says.
-        mask: Picture of the same proportions that is multiplied with the alpha.
 
     Returns:
         Pixels, dtype uint8, shape (H, W, 3), or (H, W, 4) with colours that are multiplied with alpha. Their lens is

@@ -34,11 +34,9 @@ def initial_points(
     Otherwise they would end as haze that only this camera sees.
 
     Args:
-        capture: The capture.
         source: ``capture`` for the points of the capture, ``random`` for a cube, ``auto`` for the points of the capture
             if it has any, else random; ``consistent`` for :func:`consistent_points`; or a .ply file with points.
         count: Number of random or consistent points. All points of a capture or a file are used.
-        seed: Seed of the random numbers.
         half_side: Half the side of the cube [scene units]. The default is how far the median camera sees to each side
             of the point that all cameras look at.
 
@@ -71,8 +69,6 @@ def random_points(center: Tensor, half_side: float, count: int, seed: int = 0) -
     Args:
         center: Centre of the cube [scene units], shape (3,).
         half_side: Half its side [scene units].
-        count: Number of points.
-        seed: Seed of the random numbers.
     """
     check_vector("center", center)
     check_positive("half_side", half_side)
@@ -111,9 +107,6 @@ def consistent_points(capture: Capture, count: int, seed: int = 0, half_side: fl
     the distance up to ten times its half side; each half gives half of the points, so that the background has some.
 
     Args:
-        capture: The capture; photos with alpha are put over black.
-        count: Number of points.
-        seed: Seed of the random numbers.
         half_side: Half the side of the cube [scene units]; that of :func:`initial_points` by default.
 
     Returns:

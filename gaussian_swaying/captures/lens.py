@@ -57,7 +57,6 @@ def undistort(points: Tensor, coefficients: tuple[float, ...], iterations: int =
     Args:
         points: Distorted points of the image plane at depth 1, shape (..., 2).
         coefficients: k1, k2, p1, p2, k3.
-        iterations: Number of Newton steps.
 
     Returns:
         Pinhole points, shape (..., 2).
@@ -184,8 +183,6 @@ def remap(image: Tensor, source: Lens, target: Lens) -> Tensor:
 
     Args:
         image: Picture taken with ``source``, channels first, floating point, shape (C, H, W).
-        source: Lens of ``image``.
-        target: Lens of the result, without distortion.
 
     Returns:
         The picture, shape (C, ``target.height``, ``target.width``).

@@ -86,11 +86,6 @@ def photos_beside(folder: Path, used: Iterable[Path], masks: Iterable[Path | Non
     """Photos in the same folders as those of a capture, which it does not have.
 
     Pictures made of a photo do not count: their names begin with its name, as ``r_0_depth_0001.png`` with ``r_0``.
-
-    Args:
-        folder: The folder of the capture.
-        used: The photos of the capture.
-        masks: Their masks.
     """
     used = set(used)
     inside = [path.relative_to(folder).parts for path in used if path.is_relative_to(folder)]

@@ -30,12 +30,7 @@ class PointCloud:
 
 
 def read_ply_points(path: Path, origin: Origin = NO_ORIGIN) -> PointCloud:
-    """Read the vertices of a .ply file, ASCII or binary; grey if they have no colours.
-
-    Args:
-        path: The file.
-        origin: Point of the file from which the vertices count.
-    """
+    """Read the vertices of a .ply file, ASCII or binary; grey if they have no colours."""
     from plyfile import PlyData, PlyParseError
 
     try:

@@ -127,8 +127,6 @@ def lens_of_transforms(where: str, data: dict[str, Any], frame: dict[str, Any], 
 
     Args:
         where: The file, for messages.
-        data: Its fields.
-        frame: Those of the frame.
         size: Width and height of the pictures, if the file does not say them [pixels].
     """
     fields = _merged(data, frame)

@@ -230,7 +230,6 @@ def did_you_mean(message: str, parser: ArgumentParser) -> str:
     """A question to add to a message about an unknown option; empty if nothing comes close.
 
     Args:
-        message: The parser's message.
         parser: The parser, for the names of its options.
     """
     for pattern in _UNKNOWN:
@@ -277,13 +276,7 @@ def _arguments(class_path: str) -> dict[str, str]:
 
 
 def command(arguments: Sequence[str], *more: str, without: str | None = None) -> str:
-    """The command line of this program with additional arguments, ready to paste into a shell.
-
-    Args:
-        arguments: The arguments with which it was started.
-        more: Arguments to add at the end, unless they are already there.
-        without: An option to remove with its value, because ``more`` sets it again.
-    """
+    """The command line of this program with additional arguments, ready to paste into a shell."""
     kept, skip = [], False
     for argument in arguments:
         if skip or (without and argument.startswith(f"{without}=")):
@@ -296,14 +289,7 @@ def command(arguments: Sequence[str], *more: str, without: str | None = None) ->
 
 
 def how_to_resume(checkpoint: Path, frame: int, arguments: Sequence[str], diverged: bool = False) -> str:
-    """A sentence that names the checkpoint of a simulation, and the command that continues it.
-
-    Args:
-        checkpoint: The file.
-        frame: Its frame.
-        arguments: Command line of the run.
-        diverged: Whether the run diverged, so that the same settings would diverge again.
-    """
+    """A sentence that names the checkpoint of a simulation, and the command that continues it."""
     held = f"{checkpoint} contains the run up to frame {frame}"
     if diverged:
         return f"{held}; continuing from it would diverge again, so change the settings and start without --resume."

@@ -58,8 +58,8 @@ def build_options() -> argparse.ArgumentParser:
     parser.add_argument(
         "--player",
         action="store_true",
-        help="Write what plays .sway files elsewhere into the folder `source`: a module for three.js and Spark, and "
-        "the element <gaussian-swaying>, which also shows pages that simulate.",
+        help="Write what plays .sway files elsewhere into the folder `source`: modules for three.js with Spark "
+        "and for PlayCanvas, and the element <gaussian-swaying>, which also shows pages that simulate.",
     )
     parser.add_argument(
         "--apart",

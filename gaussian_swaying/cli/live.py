@@ -73,12 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def split(parser: ArgumentParser, arguments: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
-    """The options of this command with the scene, and those of ``gaussian-swaying sim``, in any order.
-
-    Args:
-        parser: From :meth:`Simulation.parser`; it knows which options have a value.
-        arguments: The command line.
-    """
+    """The options of this command with the scene, and those of ``gaussian-swaying sim``, in any order."""
     options, rest = build_options().parse_known_args(arguments)
     scenes, further = words_of(parser, rest)
     if len(scenes) > 1:
@@ -90,13 +85,7 @@ def split(parser: ArgumentParser, arguments: Sequence[str]) -> tuple[argparse.Na
 
 
 def session_of(parser: ArgumentParser, settings: Namespace, real_time: bool) -> Session:
-    """A session of a scene, not started yet.
-
-    Args:
-        parser: From :meth:`Simulation.parser`.
-        settings: The settings as they were configured.
-        real_time: Whether a trial chooses the grid; it then prints what it chose. A solver of one's own has no grid.
-    """
+    """A session of a scene, not started yet."""
     if settings.copies:
         raise ValueError("The live page shows one object: leave out `copies`, or record them with `sim`.")
     simulation = Simulation.from_settings(parser, settings)

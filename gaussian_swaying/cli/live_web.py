@@ -36,11 +36,7 @@ def build_options() -> argparse.ArgumentParser:
 
 
 def export_live_web(arguments: Sequence[str]) -> None:
-    """Write the page that a command line asks for, and report its size.
-
-    Args:
-        arguments: The command line.
-    """
+    """Write the page that a command line asks for, and report its size."""
     options, rest = build_options().parse_known_args(arguments)
     parser = Simulation.parser()
     words, further = words_of(parser, rest)

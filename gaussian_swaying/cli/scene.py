@@ -16,12 +16,7 @@ if TYPE_CHECKING:
 
 
 def words_of(parser: ArgumentParser, arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The words of a command line that stand alone, and the options of ``gaussian-swaying sim``, in any order.
-
-    Args:
-        parser: From :meth:`Simulation.parser`; it knows which options have a value.
-        arguments: The command line without the options of the command itself.
-    """
+    """The words of a command line that stand alone, and the options of ``gaussian-swaying sim``, in any order."""
     switches = {name for action in parser._actions if action.nargs == 0 for name in action.option_strings}
     words: list[str] = []
     further: list[str] = []
@@ -45,10 +40,8 @@ def settings_of(
     """The settings of the scene to show.
 
     Args:
-        parser: From :meth:`Simulation.parser`.
         scene: A splat, a configuration or the name of a shipped one, the folder of a run, or None for the flag or the
             ``--config`` among the further options.
-        further: Options of ``gaussian-swaying sim``.
         folder: Gets a file with the parts of a splat, if it has any.
         tell: Called with the share that is done, from 0 to 1, and the name of the next task.
     """

@@ -27,7 +27,6 @@ def with_shipped(arguments: Sequence[str], kind: str) -> list[str]:
     """The command line with ``--config NAME`` replaced by the shipped file, unless there is a file NAME.
 
     Args:
-        arguments: The command line.
         kind: ``sim`` or ``train``.
     """
     words: list[str] = []

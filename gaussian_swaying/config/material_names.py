@@ -17,9 +17,6 @@ def with_named_materials(found: Any) -> Any:
     """A configuration with numbers in place of the names in ``material`` and ``material.regions``.
 
     Its ``solver.damping`` is that of the material, unless it gives its own or has a ``custom_solver``.
-
-    Args:
-        found: What was read from YAML; anything but a mapping with a ``material`` stays as it is.
     """
     if not isinstance(found, dict) or "material" not in found:
         return found

@@ -146,13 +146,7 @@ def with_lists(arguments: Sequence[str]) -> list[str]:
 
 
 def with_custom(parser: ArgumentParser, settings: Namespace, parts: Mapping[str, Any]) -> dict[str, Any]:
-    """Instantiated parts with components of one's own in the places of those that they replace.
-
-    Args:
-        parser: From :func:`build_parser`.
-        settings: The settings that it parsed.
-        parts: What it made of them.
-    """
+    """Instantiated parts with components of one's own in the places of those that they replace."""
     found = dict(parts)
     for name, (_, replaced) in CUSTOM.items():
         own = found.pop(name, None)
@@ -185,9 +179,6 @@ def import_forces(files: Sequence[str | os.PathLike[str]]) -> None:
     """Import the classes of ``forces`` in configuration files, so that the numbers that they name are known.
 
     Files that cannot be read and modules that cannot be imported are left to the parser, which names the error.
-
-    Args:
-        files: YAML files.
     """
     import yaml
 
@@ -201,12 +192,7 @@ def import_forces(files: Sequence[str | os.PathLike[str]]) -> None:
 
 
 def parse_file(parser: ArgumentParser, path: str | os.PathLike[str]) -> Namespace:
-    """The settings of a configuration file.
-
-    Args:
-        parser: From :func:`build_parser`.
-        path: The YAML file.
-    """
+    """The settings of a configuration file."""
     arguments = ["--config", os.fspath(path)]
     try:
         return parser.parse_args(arguments)
@@ -215,13 +201,7 @@ def parse_file(parser: ArgumentParser, path: str | os.PathLike[str]) -> Namespac
 
 
 def parse_text(parser: ArgumentParser, text: str, arguments: Sequence[str] = ()) -> Namespace:
-    """The settings of a configuration that is not in a file.
-
-    Args:
-        parser: From :func:`build_parser`.
-        text: The YAML.
-        arguments: Options that override it.
-    """
+    """The settings of a configuration that is not in a file."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "starter.yaml"
         path.write_text(text, encoding="utf-8")
@@ -229,12 +209,7 @@ def parse_text(parser: ArgumentParser, text: str, arguments: Sequence[str] = ())
 
 
 def check_settings(schema: type, settings: Namespace) -> None:
-    """Raise ValueError if parsed settings contain something that a configuration cannot.
-
-    Args:
-        schema: As in :func:`build_parser`.
-        settings: The settings that its parser returned.
-    """
+    """Raise ValueError if parsed settings contain something that a configuration cannot."""
     from jsonargparse import Namespace
 
     for name in COMMAND_LINE_ONLY:
@@ -402,11 +377,7 @@ class CommonHelp(Action):
 
 
 def common_help(parser: ArgumentParser) -> str:
-    """Return the help on the options of ``COMMON``, with the texts of the full help.
-
-    Args:
-        parser: From :func:`~gaussian_swaying.config.parser.build_parser`.
-    """
+    """Return the help on the options of ``COMMON``, with the texts of the full help."""
     known = {action.dest: action for action in parser._actions}
     helps = _ArgumentGroup(parser, "Help")
     helps._group_actions = [

@@ -265,13 +265,6 @@ def evaluate(
 ) -> dict[str, Any]:
     """Compare and write ``eval.json``, ``eval.md`` and ``comparison.mp4`` to a folder, each completely or not at all.
 
-    Args:
-        run: Folder of a run.
-        reference: Folder of the reference.
-        output: Folder to write to; results of an earlier comparison are replaced.
-        video: Whether to make the video.
-        options: Further arguments of :func:`compare_run`.
-
     Returns:
         The result of :func:`compare_run`.
     """

@@ -34,7 +34,6 @@ def comparison_picture(
     Args:
         reference: Picture from 0 to 1, shape (H, W, 3).
         image: Picture of the run, of the same shape.
-        labels: Texts above the two.
 
     Returns:
         Picture, uint8, shape (h + band, 3 w + gaps, 3).

@@ -72,8 +72,6 @@ def surface_points(vertices: Tensor, faces: Tensor, count: int, seed: int = 0) -
     Args:
         vertices: Vertices [m], shape (V, 3).
         faces: Triangles, shape (F, 3).
-        count: Number of points.
-        seed: Seed of the random numbers.
 
     Returns:
         Points [m], float32, shape (count, 3).

@@ -155,9 +155,6 @@ def cells(
         ray: Directions in the plane of each site, shape (B, rays, 2).
         open_cosine: Cosine below which a direction is open, for each number of neighbours, shape (k + 1,).
         cluster: Distance of what counts as one, as a share of that to the last neighbour.
-        slab: Half thickness of a sheet, in spacings.
-        spike: Longest reach, in spacings.
-        reach: Longest reach, in sizes nearby.
 
     Returns:
         Shapes (B,) and (B, k), bool.

@@ -27,9 +27,6 @@ def read_splat(path: str | os.PathLike[str]) -> GaussianCloud:
 
     Colours, opacities and quaternions have 8 bits; an opacity at the end of its range is moved inwards by half a step.
 
-    Args:
-        path: File to read.
-
     Returns:
         The Gaussians as float32 tensors on the CPU, without normals.
     """
@@ -51,9 +48,6 @@ def read_compressed_ply(path: str | os.PathLike[str]) -> GaussianCloud:
     Each chunk of 256 Gaussians has ranges for centres, sizes and, in newer files, colours; within them centres and
     sizes have 11, 10 and 11 bits, colours and opacities 8. Quaternions store their three smaller components with 10
     bits, harmonics 8 bits from -4 to 4.
-
-    Args:
-        path: File to read.
 
     Returns:
         The Gaussians as float32 tensors on the CPU, without normals.

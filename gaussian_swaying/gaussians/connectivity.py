@@ -153,7 +153,6 @@ def pieces(cell: Tensor, pairs: Tensor) -> tuple[Tensor, Tensor]:
 
     Args:
         cell: A number for the cell of each Gaussian, from 0 on, shape (N,).
-        pairs: See :func:`attached_pairs`.
 
     Returns:
         The piece of each, shape (N,), and whether its cell has several of at least :data:`STRAY` Gaussians, (N,).

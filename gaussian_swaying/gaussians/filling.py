@@ -55,10 +55,7 @@ def density_grid(
         opacities: Opacities o from 0 to 1, shape (N,).
         low: Lower corner of the grid [m], shape (3,).
         spacing: Side of a cell h [m].
-        resolution: Number of cells along x, y and z.
         max_radius: Longest reach of a kernel [cells].
-        chunk: Number of values computed at once; the result does not depend on it.
-        advance: Called with the number of Gaussians just processed.
 
     Returns:
         Density in float32, shape (nx, ny, nz).
@@ -216,10 +213,8 @@ def sheet_depth(density: Tensor, cells: Tensor, covariances: Tensor, threshold: 
     s sqrt(2 log(d / threshold)).
 
     Args:
-        density: From :func:`density_grid`.
         cells: Centres of the Gaussians in cells from the centre of the first, shape (N, 3).
         covariances: Covariances [cells²], shape (N, 3, 3).
-        threshold: Density above which a cell is dense.
 
     Returns:
         Between 0.5 and 4.
@@ -336,7 +331,6 @@ class InteriorFilling:
             opacities: Opacities from 0 to 1, shape (N,).
             spacing: Side of a cell [m], used if the object has none.
             progress: Show a progress bar if it takes more than a second.
-            chunk: Number of values computed at once; the result does not depend on it.
 
         Returns:
             Points, volumes, and which Gaussians are on the surface.
@@ -402,8 +396,6 @@ def solid_elements(field: Tensor, side: int, chunk: int = _CHUNK) -> Tensor:
 
     Args:
         field: Depth below the surface [cells], shape (nx, ny, nz).
-        side: Elements along the side of a cell.
-        chunk: Number of elements checked at once.
 
     Returns:
         One number for each, z fastest, ascending, shape (K,).

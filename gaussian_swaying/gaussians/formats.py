@@ -83,12 +83,7 @@ class Format:
         return "rotation" in self.options
 
     def losses(self, cloud: GaussianCloud, **options: object) -> list[str]:
-        """What a file will not hold, with the number of Gaussians: a part of a sentence for each kind.
-
-        Args:
-            cloud: The Gaussians, cleaned.
-            options: Those of the format.
-        """
+        """What a file will not hold, with the number of Gaussians: a part of a sentence for each kind."""
         told, count, cloud = list[str](), len(cloud), cloud.to("cpu", torch.float32)
         low, high, most, faintest = self.small, self.large, self.harmonics, self.faintest
         thin, wide = cloud.scales.amin(-1), cloud.scales.amax(-1)
@@ -295,7 +290,6 @@ def cleaned(path: Path, cloud: GaussianCloud) -> GaussianCloud:
 
     Args:
         path: The file, for messages.
-        cloud: The Gaussians.
 
     Returns:
         The same, or a smaller cloud, with quaternions of unit length.
@@ -377,7 +371,6 @@ def export_frames(
             frame, counted from 0: ``frame_####.spz`` makes frame_0000.spz, frame_0001.spz, ... Its folder is made.
         clouds: One for each frame; read one by one.
         fps: Frames per second, for USD.
-        options: Further ones of :func:`export_cloud`.
 
     Returns:
         The files.

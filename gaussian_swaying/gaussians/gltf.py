@@ -42,9 +42,6 @@ def read_gltf(path: str | os.PathLike[str]) -> GaussianCloud:
 
     All primitives of the scene that have the extension are read. Buffers may be in the file, or in files beside it.
 
-    Args:
-        path: File to read.
-
     Returns:
         The Gaussians as float32 tensors on the CPU, without normals.
     """
@@ -69,7 +66,6 @@ def encode_gltf(cloud: GaussianCloud, rotation: Tensor | None = None, metres_per
     Programs that do not know the extension show points in the colours of degree 0.
 
     Args:
-        cloud: The Gaussians, finite (see :func:`~gaussian_swaying.gaussians.formats.cleaned`).
         rotation: Rotation from scene directions to z up, shape (3, 3); the scene's z is up if None.
         metres_per_unit: Length of a scene unit [m].
 

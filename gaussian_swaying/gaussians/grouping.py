@@ -112,7 +112,6 @@ def connected_parts(points: Tensor, cell: float) -> Tensor:
 
     Args:
         points: Shape (N, 3).
-        cell: Size of a cell.
 
     Returns:
         Numbers from 0, shape (N,).

@@ -52,7 +52,6 @@ def guess_hold(
     - most things stand (0.5), an upright sheet hangs (1), or flies from a pole somewhere else (0.5).
 
     Args:
-        splat: The simulated Gaussians.
         up: Up direction, a unit vector.
         cell: Grid spacing [scene units]: parts within two cells touch.
         left_out: Centres of solid Gaussians that are not simulated [scene units], shape (M, 3).

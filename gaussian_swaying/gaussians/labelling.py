@@ -23,7 +23,6 @@ def connected(cloud: GaussianCloud, seed: Sequence[float], reach: float | None =
     """The Gaussians that are connected to a place, from neighbour to neighbour, bool, shape (N,).
 
     Args:
-        cloud: The splat.
         seed: A place [scene units]; its nearest Gaussian is the first.
         reach: Twice the side of a cell [scene units]; Gaussians in the same or in touching cells are connected. Four
             spacings if None (see :func:`~gaussian_swaying.geometry.neighbours.particle_spacing`).
@@ -39,7 +38,6 @@ def alike(
     """The Gaussians that are connected to a place and look like it, bool, shape (N,).
 
     Args:
-        cloud: The splat.
         seed: A place [scene units]; its nearest Gaussian is the first.
         color: Largest difference from the mean colour there, as a distance in red, green and blue from 0 to 1.
         angle: Largest angle between the normals of two neighbours, of either sign [degrees]; 90 to ignore them.

@@ -81,7 +81,6 @@ class Guess:
         name: Its name: a direction or an end.
         direction: The direction that it stands for, a unit vector in scene axes.
         confidence: ``high``, ``medium`` or ``low``, by the lead over the next best; ``given`` if it was.
-        reasons: In words.
         scores: Points of each possibility; empty if there was one.
         options: Values of the option for this one and the next best; empty if it was given.
     """
@@ -183,8 +182,6 @@ def largest_plane(points: Array, weight: Array, half: float, axis: Array | None 
 
     Args:
         points: Shape (N, 3).
-        weight: Shape (N,).
-        half: The distance.
         axis: Direction from which the normal is at most 45 degrees away; None for any.
 
     Returns:

@@ -55,9 +55,6 @@ def check_count(path: Path, count: int, harmonics: int, size: int | None = None)
     """Raise ValueError if a file announces more Gaussians than it can hold, by the memory that reading them takes.
 
     Args:
-        path: The file.
-        count: Number of Gaussians.
-        harmonics: Number of harmonics of each, with the constant.
         size: Size of all files that hold them [bytes]; that of the file if None.
     """
     check_unpacked(path, _PEAK * count * (44 + 12 * harmonics), f"a `count` of {count:,} Gaussians", size)

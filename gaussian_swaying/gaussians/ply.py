@@ -36,7 +36,6 @@ def read_ply(path: str | os.PathLike[str], sh_degree: int | None = None) -> Gaus
     writes it, Gaussians are flat.
 
     Args:
-        path: File to read.
         sh_degree: Largest degree of spherical harmonics that is kept; None for all.
 
     Returns:

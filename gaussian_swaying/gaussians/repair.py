@@ -53,9 +53,6 @@ def repaired(
 
     Args:
         path: The file, for messages.
-        cloud: Gaussians, as they are stored there.
-        most: Share of them that may be left out.
-        others: Further faults, as :func:`faults` gives them.
 
     Raises:
         ValueError: If more have none.
@@ -97,7 +94,6 @@ def check_units(path: Path, cloud: GaussianCloud) -> None:
 
     Args:
         path: The file, for messages.
-        cloud: Its Gaussians.
     """
     wide, told = cloud.scales.amax(-1), list[str]()
     if len(cloud) < _FEW:
@@ -127,7 +123,6 @@ def cloud_of(path: Path, others: dict[str, np.ndarray] | None = None, **columns:
 
     Args:
         path: The file, for messages.
-        others: Further faults, as :func:`faults` gives them.
         columns: The fields of :class:`GaussianCloud` but its origin, with their shapes and units.
     """
     origin = origin_of(columns["means"])

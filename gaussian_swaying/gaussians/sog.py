@@ -47,7 +47,6 @@ def read_sog(path: str | os.PathLike[str], level: int = 0) -> GaussianCloud:
     opacities and rotations have 8 bits. Of a streamed scene, one level of detail is read.
 
     Args:
-        path: File to read; the pictures of a meta.json lie beside it.
         level: Level of detail of a streamed scene; 0 is the finest.
 
     Returns:
@@ -64,9 +63,6 @@ def encode_sog(cloud: GaussianCloud) -> bytes:
     """A bundle (.sog). The Gaussians are sorted along a space-filling curve, which makes the file smaller.
 
     Up to 65,536 different sets of harmonics beyond degree 0 are kept; where there are more, similar ones are averaged.
-
-    Args:
-        cloud: The Gaussians, finite (see :func:`~gaussian_swaying.gaussians.formats.cleaned`).
 
     Returns:
         The content of the file.

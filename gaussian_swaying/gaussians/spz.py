@@ -43,9 +43,6 @@ def read_spz(path: str | os.PathLike[str]) -> GaussianCloud:
     in version 1). An opacity at the end of its range is moved inwards by half a step. The axes are those of the file:
     y is up by Niantic's convention, but many converters leave the axes of a .ply. Harmonics of degree 4 are left out.
 
-    Args:
-        path: File to read.
-
     Returns:
         The Gaussians as float32 tensors on the CPU, without normals.
     """
@@ -88,7 +85,6 @@ def encode_spz(cloud: GaussianCloud, spz_version: int = 3) -> bytes:
     between 4.5e-5 and 380 scene units, in steps of 6 %. Harmonics have 5 bits in band 1 and 4 above.
 
     Args:
-        cloud: The Gaussians, finite (see :func:`~gaussian_swaying.gaussians.formats.cleaned`).
         spz_version: 3 is read by most programs; 4 needs zstandard; 1 and 2 have coarser rotations, and 1 centres in
             half precision.
 

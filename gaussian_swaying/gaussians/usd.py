@@ -39,10 +39,8 @@ def write_usd(
     programs that cannot draw splats there are ``displayColor`` and ``displayOpacity``.
 
     Args:
-        path: File to write; an existing one is replaced.
         clouds: One for each frame, all of the same size; read one by one.
         fps: Frames per second.
-        start: Number of the first frame.
         metres_per_unit: Length of a scene unit [m].
         rotation: Rotation from scene directions to z up, shape (3, 3); the scene's z is up if None.
     """
@@ -63,9 +61,6 @@ def usd_arrays(cloud: GaussianCloud) -> dict[str, np.ndarray]:
 
     A Gaussian of a moving splat cannot be left out of a frame, so one that is not finite becomes a transparent point at
     the origin.
-
-    Args:
-        cloud: N Gaussians with K harmonics each.
 
     Returns:
         ``positions`` (N, 3), ``orientations`` (N, 4) wxyz, ``scales`` (N, 3) and ``opacities`` (N,) as displayed,

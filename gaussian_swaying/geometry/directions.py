@@ -14,9 +14,6 @@ _SIDES = 128  # sides of the outline that a line sees
 def spread_lines(count: int) -> Tensor:
     """Unit vectors spread evenly over half a sphere, one for each line through its centre, on a spiral.
 
-    Args:
-        count: Number of lines.
-
     Returns:
         Shape (count, 3), float64.
     """

@@ -50,7 +50,6 @@ def sums(values: Tensor, group: Tensor, count: int | None = None) -> Tensor:
     """Sum of values (N, ...) over the members of each group (N,), differentiable in the values.
 
     Args:
-        values: Shape (N, ...).
         group: The group of each, from 0 on, shape (N,).
         count: Number of groups M; the largest group plus one if None.
 
@@ -67,7 +66,6 @@ def once(pairs: Tensor, count: int) -> Tensor:
 
     Args:
         pairs: Their numbers, int64, shape (K, 2).
-        count: Number of items.
 
     Returns:
         The smaller number first, shape (E, 2).
@@ -81,7 +79,6 @@ def joined(count: int, pairs: Tensor) -> Tensor:
     """Connected components: the component of each of ``count`` items, from the pairs that are connected.
 
     Args:
-        count: Number of items.
         pairs: Their numbers, shape (2, K).
 
     Returns:

@@ -224,11 +224,9 @@ def from_principal(
     not available.
 
     Args:
-        parts: From :func:`spectrum`.
         function: Principal values y (..., 3) from stretches (..., 3). It may couple the three, but must be symmetric in
             them: permuted stretches give permuted values. Other tensors that it uses get gradients too.
         values: ``function(parts.stretch)``, if already computed.
-        rotated: Return R V diag(y) V^T = U diag(y) V^T instead.
 
     Returns:
         Shape (..., 3, 3).

@@ -33,9 +33,6 @@ _JITTER = (0.00191, 0.00317, 0.00253)  # of a cell: no ray runs along an edge of
 def read_mesh(path: str | os.PathLike[str]) -> tuple[Tensor, Tensor]:
     """Vertices and triangles of a .ply or .obj file; polygons are cut into fans.
 
-    Args:
-        path: The file.
-
     Returns:
         Vertices, shape (V, 3), float64, and triangles, shape (T, 3), int64.
     """
@@ -133,7 +130,6 @@ def mesh_distance(vertices: Tensor, faces: Tensor, cells: int = 48) -> DistanceG
     Args:
         vertices: Shape (V, 3).
         faces: Triangles, shape (T, 3).
-        cells: Number of cells along the longest side of the mesh; the distance is accurate to a fraction of a cell.
 
     Returns:
         The distances, on a grid that reaches three cells beyond the mesh.

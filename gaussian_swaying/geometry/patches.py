@@ -189,7 +189,6 @@ def deform_all(
         deformation_gradient: Total deformation gradient F, shape (N, 3, 3).
         covariances: Covariances A at rest [scene units^2], shape (N, 3, 3).
         normals: Unit normals N at rest, shape (N, 3).
-        rotations: Whether to compute the rotations.
         max_stretch: Largest ratio of the sizes, above 1; None for none.
         solid: Which Gaussians are solid, bool, shape (N,); needed with ``max_stretch``.
 

@@ -376,7 +376,6 @@ def whereabouts(region: Region, points: Tensor, rotation: Tensor) -> tuple[str, 
     Winds and other velocities have z up, but regions are in the axes of the scene, in which up may be another axis.
 
     Args:
-        region: The region.
         points: Points as :meth:`Region.contains` takes them, shape (..., 3).
         rotation: Scene axes to axes with z up, shape (3, 3).
 

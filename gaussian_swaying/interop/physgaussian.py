@@ -527,9 +527,7 @@ def convert(
     to the scene once its splat is known. Vectors are rotated with :func:`heading`.
 
     Args:
-        config: The JSON object.
         cameras: ``cameras.json`` of the 3DGS model, for ``default_camera_index`` and the lens.
-        sticky_planes: Make every plane sticky, as PhysGaussian's code does whatever ``surface`` says.
 
     Returns:
         The settings, without a splat (``scene.ply`` must be set), and sentences about everything whose meaning differs.
@@ -659,11 +657,6 @@ def camera_settings(take: Fields, cameras: str | None) -> dict[str, Any]:
 
 def to_yaml(settings: Mapping[str, Any], notes: Iterable[str] = (), source: str | None = None) -> str:
     """Settings as a YAML file for ``--config``, with the notes as comments at the top.
-
-    Args:
-        settings: From :func:`convert`.
-        notes: From :func:`convert`.
-        source: Name of the file that was converted.
 
     Returns:
         The text.

@@ -72,8 +72,6 @@ def cut_clips(video: Tensor, length: int, stride: int) -> Tensor:
 
     Args:
         video: Frames, shape (T, 3, H, W).
-        length: Frames in a clip.
-        stride: Frames from the start of one clip to the start of the next.
 
     Returns:
         A view of the video, shape (clips, length, 3, H, W).
@@ -161,7 +159,6 @@ class FrechetVideoDistance(Metric):
 
         Args:
             video: Frames with values from 0 to 1, shape (T, 3, H, W) or (B, T, 3, H, W).
-            real: Whether these videos are the reference.
         """
         check_shape("video", video, "T", 3, "H", "W")
         if video.dim() > 5:

@@ -101,7 +101,6 @@ class Composed(Constant):
         given: The device functions.
 
     Attributes:
-        functions: The functions themselves.
         options: The options of each, and its parts.
         per_point: First and number of the numbers of a point, for each device function; the others likewise.
         numbers: Those of all points.
@@ -179,10 +178,6 @@ class Packed:
 
     def take(self, given: Sequence[DeviceFunction], steps: int) -> Tensor | None:
         """Bring the buffers up to date; what one device function has is written only if its sources have changed.
-
-        Args:
-            given: The device functions; the same list need not be composed again.
-            steps: Most substeps of a rollout.
 
         Returns:
             The numbers of the points, shape (N, n); None if all is as it was. It never is for tensors of inference

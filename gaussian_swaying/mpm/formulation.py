@@ -206,7 +206,6 @@ class Formulation(ABC):
 
         Args:
             position: Particle position [m], shape (..., P, 3).
-            margin: Extra cells on each side.
             speed: Largest speed [m/s], for the error message.
         """
         dx = self.settings.dx
@@ -238,7 +237,6 @@ class Formulation(ABC):
         """One substep of ``dt`` [s] in torch.
 
         Args:
-            state: The state now.
             dt: Substep [s].
             force: Force on each particle [N], shape (..., P, 3), or None.
             drag: Its resistance [kg/s], shape (..., P), or None; see ``MPMSolver.step``.
@@ -397,8 +395,6 @@ def pinned_share(held: Pinned, stencil: Stencil, inverse_mass: Tensor, time: Ten
     """Share of the mass of each node that held particles have at a time, shape (..., G).
 
     Args:
-        held: The particles.
-        stencil: Support of all particles.
         inverse_mass: Inverse mass of each node [1/kg], 0 for a node without mass, shape (..., G).
         time: The time [s], scalar float64 tensor.
     """

@@ -304,7 +304,6 @@ class Structure:
         """Find the modes.
 
         Args:
-            most: Largest number of modes.
             guess: Square of the first circular frequency, if it is roughly known [1/s²]; it saves time.
         """
         S = self.spread
@@ -465,12 +464,6 @@ def analysis_of(total: Total, scene: int, most: int, guess: float | None = None)
 
     The cache is in the folder of compiled kernels, by the content of the body: its points, pins, relative masses and
     stiffnesses and its grid. A factor of all masses or moduli changes nothing in it.
-
-    Args:
-        total: The body, bound to its grid.
-        scene: Which scene of a batch.
-        most: Largest number of modes.
-        guess: See :meth:`Structure.analyse`.
     """
     path = cache_folder() / f"modes_{_content(total, scene, most)}.npz"
     numbers = _numbers(total, scene)

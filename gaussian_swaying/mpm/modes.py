@@ -344,7 +344,6 @@ class Modes(Total):
         """The state in which a steady force is in balance with the stiffness, by damped iteration.
 
         Args:
-            force: A force that has groups (``Force.on_sites``), such as a steady wind.
             rounds: Iterations, each of which goes half of the way.
         """
         state = self.first_state(torch.zeros_like(self.points.position), 0)
@@ -496,10 +495,8 @@ class SiteForces:
         """Take the numbers of the forces for some substeps.
 
         Args:
-            forces: Those on sites.
             time: Time at which the first one acts [s], scalar float64 tensor.
             dt: Substep [s].
-            steps: Number of substeps.
         """
         values = self.loads.take(forces, steps)
         if values is not None:
@@ -511,7 +508,6 @@ class SiteForces:
 
         Args:
             moved: Displacements and turns of the sites, and their rates, shape (..., 6 S, 2).
-            step: Number of the substep since :meth:`prepare`.
 
         Returns:
             Shape (..., S, 8), the last column unused.

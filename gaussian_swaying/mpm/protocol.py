@@ -28,7 +28,7 @@ class Solver(nn.Module, ABC):
     """Base class of solvers: what a :class:`~gaussian_swaying.simulation.simulation.Simulation` needs of one.
 
     A solver takes material points at rest and advances a :class:`~gaussian_swaying.mpm.state.State` under forces. The
-    Gaussians follow the points. Only four methods have to be written; examples/mass_spring_cloth.py is a whole one.
+    Gaussians follow the points. Only four methods have to be written; examples/python/own_solver.py is a whole one.
 
     Attributes:
         formulation: Its name in the summary of a run.
@@ -76,10 +76,7 @@ class Solver(nn.Module, ABC):
         """Advance by several substeps.
 
         Args:
-            state: The state now.
             dt: Substep [s].
-            steps: Number of substeps.
-            forces: Forces on the points besides gravity, in the state at the start of each substep.
         """
 
     @abstractmethod
@@ -142,13 +139,7 @@ class Solver(nn.Module, ABC):
         return None
 
     def continued(self, other: Solver, state: Any, start: Any) -> Any:
-        """The motion of another solver as a state of this one; None if it cannot go on from it.
-
-        Args:
-            other: The solver that made ``state``.
-            state: Its state now.
-            start: The state at rest of this solver.
-        """
+        """The motion of another solver as a state of this one; None if it cannot go on from it."""
         return None
 
     def domain(self, state: Any) -> tuple[Sequence[float], Sequence[float]]:
@@ -168,7 +159,6 @@ class Solver(nn.Module, ABC):
         """Return the number of equal substeps of the next frame of ``frame_dt`` seconds.
 
         Args:
-            state: The state now.
             frame_dt: Length of the frame [s].
             cells: The result of :meth:`cells_per_second`, if it is known.
         """
@@ -198,11 +188,7 @@ class Solver(nn.Module, ABC):
         """Advance by several substeps and check the Courant number on the way, as material may stiffen or soften.
 
         Args:
-            state: The state now.
             dt: Substep [s].
-            steps: Number of substeps.
-            forces: As in :meth:`rollout`.
-            looks: Number of checks, about evenly spaced, the last one at the end; fewer in short rollouts.
             watch: Called from time to time with the number of substeps that are done, or queued on a GPU.
             check: Whether to raise errors at once; if not, the measurements of the frame find what is wrong.
 

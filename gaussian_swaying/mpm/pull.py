@@ -37,7 +37,6 @@ def pull(per_point: Callable[[], torch.Tensor], place: Callable[..., torch.Tenso
     Args:
         per_point: Returns where each point belongs from the place [m], and the mass that is held, shape (..., P, 4).
         place: Returns the place [m] at the start of substeps, by time, substep and their number, shape (steps, 3).
-        further: Further fields of the :class:`DeviceFunction`.
     """
     own, now = Numbers(4, per_point), Numbers(3, place)
     options = (QUICK, STRONGEST)

@@ -69,8 +69,6 @@ def flattened(F, n, mu, lam):
     to first order for other laws.
 
     Args:
-        F: Deformation gradient.
-        n: Unit normal at rest, zero where there is no sheet.
         mu: Shear modulus [Pa].
         lam: First Lamé parameter [Pa].
 
@@ -149,7 +147,6 @@ def stress_of_sheets(F: Tensor, normal: Tensor, mu: Tensor, lam: Tensor, pk1: Ca
         normal: Unit normals at rest, zero where there is no sheet, shape (..., 3).
         mu: Shear moduli [Pa], shape (...).
         lam: First Lamé parameters [Pa], shape (...).
-        pk1: The stress of the law at a deformation gradient.
 
     Returns:
         Shape (..., 3, 3).
@@ -223,8 +220,6 @@ def bending_of(points: MaterialPoints, stencil: Stencil, dx: float, softened: Te
     """The bending of the sheets of a material; None if it has none.
 
     Args:
-        points: The material, of which ``normal`` and ``bending`` say what bends.
-        stencil: Support of its points at rest.
         dx: Grid spacing [m].
         softened: Factor of the stiffness of each point, shape (..., P); None for one.
     """

@@ -61,9 +61,6 @@ class GridSpec:
 
         It has four more cells on each side, or an eighth of the length (if that is more) on sides where ``before`` was
         too small. An object that keeps growing or moving in that direction then needs new grids less and less often.
-
-        Args:
-            before: The previous grid.
         """
         offset, resolution = [], []
         for a, n, b, m in zip(self.offset, self.resolution, before.offset, before.resolution, strict=True):
@@ -91,7 +88,6 @@ def bounding_grid(low: Tensor, high: Tensor, dx: float, margin: int) -> GridSpec
         low: Smallest coordinates of the points [m], shape (3,).
         high: Largest coordinates of the points [m], shape (3,).
         dx: Grid spacing [m].
-        margin: Extra cells on each side.
 
     Returns:
         The grid.
@@ -457,10 +453,6 @@ class MPMState(State):
 
 def support_force(before: State, after: State) -> Tensor:
     """The mean force that the body exerted on each boundary between two states: on a pin, the force on its support.
-
-    Args:
-        before: The earlier state.
-        after: A later state of the same run.
 
     Returns:
         Force [N], in the order of the boundaries of the solver, shape (..., B, 3), float64; zero if no time passed.

@@ -74,7 +74,6 @@ def stable_limit(
         F: Elastic deformation gradient, shape (..., P, 3, 3); None for the rest state, where
             :math:`K = 2 \mu + 3 \lambda`.
         internal: Internal variable of the law, shape (..., P), if any has one.
-        spatial: As in :func:`wave_speed`.
         laws: The laws of ``points``, if already available.
 
     Returns:
@@ -97,7 +96,6 @@ def substeps_per_frame(frame_dt: float, substep: float, *, exact: bool) -> int:
     Args:
         frame_dt: Length of a frame [s].
         substep: Longest allowed substep [s] or, with ``exact``, the wanted one.
-        exact: Round to the nearest number (``int(frame_dt / substep)`` loses a step to rounding) instead of up.
 
     Returns:
         At least 1.
@@ -156,9 +154,7 @@ def rounding_speed(speed: float, dt: float, steps: float, dx: float, dtype: torc
     Args:
         speed: Speed of the fastest wave c [m/s].
         dt: Substep [s].
-        steps: Number of substeps n.
         dx: Grid spacing [m].
-        dtype: Precision of F.
     """
     return math.sqrt(54 * 5 / 96 * steps) * torch.finfo(dtype).eps * speed * speed * dt / dx
 
@@ -188,11 +184,6 @@ def cfl_number(dt: float | Tensor, dx: float, speed: Tensor, velocity: Tensor | 
 
 
 def look_marks(steps: int, looks: int) -> list[int]:
-    """Numbers of the substeps after which to check: multiples of the substeps in a CUDA graph, and the last one.
-
-    Args:
-        steps: Number of substeps.
-        looks: Largest number of checks.
-    """
+    """Numbers of the substeps after which to check: multiples of the substeps in a CUDA graph, and the last one."""
     unit = max(size for size in Repeater.SIZES if size == 1 or looks * size <= 2 * steps)
     return sorted({min(unit * math.ceil((k + 1) * steps / (looks * unit)), steps) for k in range(looks)})

@@ -654,13 +654,10 @@ class _Run:
     """Data of one rollout that its backward pass needs.
 
     Attributes:
-        kernels: What computes it.
         state: The state at its start, and then that at its end, without gradient.
         dt: Substep [s].
-        steps: Number of substeps.
         every: Substeps of a segment.
         forces: The force, if any.
-        watch: See ``MPMSolver.rollout``.
         starts: Displacement and velocity of the active nodes at the start of each segment, shape (nodes, 2, 3).
         kicks: Time for which forces act in the first substep of each segment [s].
     """

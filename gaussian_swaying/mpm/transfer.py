@@ -26,7 +26,6 @@ class Stencil:
         first: Flat index, over all scenes of the batch, of the lowest node on the lattice, shape (N,).
         fraction: Place of the particles in cells from that node, shape (3, N).
         inside: Particles whose 27 nodes all lie in the grid, shape (..., P). The others have no weight.
-        grid: The nodes.
         moments: Whether ``basis`` has the last three rows.
         deterministic: Whether sums over particles have the same order in every run on a GPU.
         nodes: Flat indices of the nodes, shape (27, N), where they are not those of the lattice (``virtual_nodes``).
@@ -87,12 +86,8 @@ def bspline_stencil(
 
     Args:
         position: Particle position [m], shape (..., P, 3).
-        grid: The nodes.
-        moments: Also keep ``w (x_i - x_p)``, which APIC needs.
         snap: A particle within ``snap * dx`` of a plane where a weight vanishes is moved onto it for this stencil, so
             that no node is left with only a vanishing mass.
-        deterministic: See :class:`Stencil`.
-        nodes: See :class:`Stencil`.
 
     Returns:
         The support of each particle.
@@ -171,8 +166,6 @@ def scatter(stencil: Stencil, coefficients: Tensor, fixed_order: bool = False) -
     of the sum is not fixed, so two runs may differ by round-off, unless the stencil is ``deterministic``.
 
     Args:
-        stencil: Support of each particle.
-        coefficients: Shape (..., P, A, K) with A at most the number of basis rows and K columns.
         fixed_order: As ``deterministic``, for this sum.
 
     Returns:
@@ -192,7 +185,6 @@ def gather(field: Tensor, stencil: Stencil) -> Tensor:
 
     Args:
         field: Nodal field, shape (..., G, K).
-        stencil: Support of each particle.
 
     Returns:
         Shape (..., P, A, K): row 0 the value, rows 1 to 3 the derivative along x, y, z, rows 4 to 6 the moments if the
@@ -218,7 +210,6 @@ def scatter_momentum(
         affine: Affine velocity [1/s], shape (..., P, 3, 3).
         impulse: External impulse [N s], shape (..., P, 3), or None.
         stress_impulse: Stress times rest volume times time [N m s], shape (..., P, 3, 3).
-        stencil: Support of each particle, with moments.
 
     Returns:
         Momentum [kg m/s] in columns 0 to 2 and mass [kg] in column 3, shape (..., G, 4).
@@ -238,7 +229,6 @@ def g2p(node_velocity: Tensor, stencil: Stencil) -> tuple[Tensor, Tensor, Tensor
 
     Args:
         node_velocity: Node velocity [m/s], shape (..., G, 3).
-        stencil: Support of each particle, with moments.
 
     Returns:
         Velocity [m/s] (..., P, 3), affine velocity [1/s] (..., P, 3, 3), velocity gradient [1/s] (..., P, 3, 3).

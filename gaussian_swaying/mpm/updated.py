@@ -589,11 +589,6 @@ def sorted_for(crowd: float, crossing: float, count: int) -> int:
     one with more belongs to a sheet, whose neighbours cross into other cells together; how far the interval should grow
     there is not measured.
     A small body waits for the host, not for sums.
-
-    Args:
-        crowd: Points in a cell.
-        crossing: Cells that a particle enters in a substep.
-        count: Number of particles.
     """
     crowd = max(crowd, 1.0)
     best = math.sqrt(6.4 / max(crossing, 1e-9)) * max(8 / crowd, math.sqrt(crowd / 8))

@@ -43,9 +43,6 @@ def virtual_nodes(first: Tensor, grid: GridSpec, attached: Tensor | None, scenes
 
     Args:
         first: Flat index, within its scene, of the first of the 27 nodes of each point, shape (N,), scene by scene.
-        grid: The lattice.
-        attached: See :class:`~gaussian_swaying.mpm.state.MaterialPoints`.
-        scenes: Number of scenes.
 
     Returns:
         The nodes; None if no node has a copy.
@@ -128,7 +125,6 @@ def point_with_nodes(first: Tensor, near: Tensor, point_first: Tensor, point_nod
         near: The material point that each place belongs to, shape (M,).
         point_first: First node of the cell of each point, shape (P,).
         point_node: Nodes of each point, shape (27, P).
-        grid: The grid.
 
     Returns:
         The point whose nodes each place has, shape (M,); -1 where there is none.

@@ -38,7 +38,6 @@ class Stroke:
 
     Attributes:
         part: The part to which it gave Gaussians.
-        mark: As in :meth:`Strokes.paint`.
         index: The Gaussians that it changed, each once, shape (M,).
         labels: Their labels before, shape (M,).
         known: The parts before.
@@ -85,9 +84,7 @@ class Strokes:
         """Give Gaussians to a part, which is new or the one with its name; nothing happens if it has them all.
 
         Args:
-            part: The part.
             index: The Gaussians, each once, int64, shape (M,).
-            mark: Anything that tells strokes apart.
             goes_on: Whether this belongs to the last stroke, if part and mark are the same; both go back together.
         """
         names, known = [each.name for each in self.known], self.known
@@ -126,7 +123,6 @@ class Mark:
     """Tells a stroke of a browser from others.
 
     Attributes:
-        key: The browser.
         start: Where it began [pixels].
         length: How far it went from there [pixels].
     """
@@ -221,7 +217,6 @@ class Painting:
         """Do what the brush of a browser did; nothing while no one paints.
 
         Args:
-            key: The browser.
             told: Its message: ``path`` in its window [pixels], the ``part``, and how it looks (:class:`.Eye`). A piece
                 of a stroke has the ``radius`` [pixels], whether it goes ``through`` and whether it is the ``first``; a
                 double click has ``how``, a key of :data:`TOGETHER`.

@@ -59,13 +59,7 @@ def _button(name: str, label: str, hint: str = "") -> dict[str, Any]:
 
 
 def group(name: str, controls: list[dict[str, Any]], shut: bool = False) -> dict[str, Any]:
-    """Some controls under a title.
-
-    Args:
-        name: The title.
-        controls: The controls.
-        shut: Whether they are hidden until a click on the title.
-    """
+    """Some controls under a title."""
     return {"name": name, "controls": controls, "shut": shut}
 
 
@@ -145,7 +139,6 @@ class Panel:
         """Do what a control does.
 
         Args:
-            name: Its name.
             value: Its new value; None for a button.
 
         Raises:

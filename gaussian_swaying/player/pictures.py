@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import math
-import tempfile
-import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 
 from gaussian_swaying._devices import in_double
 from gaussian_swaying.player.session import Snapshot
-from gaussian_swaying.recording.video import VideoEncoder
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.passes import PASSES
 from gaussian_swaying.rendering.tints import by_role
@@ -80,9 +75,6 @@ def draw(
     """The picture of a snapshot, uint8, shape (H, W, 3).
 
     Args:
-        snapshot: The snapshot to draw.
-        camera: The camera.
-        shown: The name of a pass.
         force_end: End of the colour scale of the wind force [Pa].
         roles: Roles whose tints the colours get, as in :func:`~gaussian_swaying.rendering.tints.by_role`, shape (N,).
     """
@@ -95,24 +87,12 @@ def draw(
     return (picture.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy()
 
 
-def enlarged(picture: np.ndarray, width: int, height: int) -> np.ndarray:
-    """A picture that was drawn small, with smooth edges at the size at which it is shown; uint8, shape (H, W, 3).
-
-    A browser would enlarge it linearly, which shows the pixels as steps, and the blocks of its JPEG as noise at edges.
-    """
-    if picture.shape[:2] == (height, width):
-        return picture
-    return np.asarray(Image.fromarray(np.ascontiguousarray(picture)).resize((width, height), Image.Resampling.LANCZOS))
-
-
 @torch.inference_mode()
 def under_cursor(snapshot: Snapshot, origin: Sequence[float], direction: Sequence[float]) -> list[float] | None:
     """The place of the first Gaussian that a ray meets [scene units]; None if it meets nothing that can be seen.
 
     Args:
-        snapshot: The snapshot to draw.
         origin: Start of the ray [scene units].
-        direction: Its direction, of any length.
     """
     scene = snapshot.simulation.scene
     means = snapshot.simulation.painter.deformed(snapshot.state).means
@@ -159,65 +139,3 @@ class PictureSize:
             self._level += 1
         if seconds < 0.3 * self.seconds and self._level > 0:
             self._level -= 1
-
-
-FPS = 25.0
-LONGEST = 120.0  # s
-
-
-class FilmStrip:
-    """Collects pictures and encodes them so that the video shows real time, however slowly they come."""
-
-    def __init__(self) -> None:
-        self._folder = tempfile.TemporaryDirectory()
-        self._path = Path(self._folder.name) / "video.mp4"
-        self._encoder = VideoEncoder(self._path, FPS)
-        self._start: float | None = None
-        self._size: tuple[int, ...] | None = None
-        self._last: np.ndarray | None = None
-        self._frames = 0
-        self._lock, self._done = threading.Lock(), False
-
-    @property
-    def seconds(self) -> float:
-        """Length so far [s]."""
-        return self._frames / FPS
-
-    @property
-    def full(self) -> bool:
-        """True if the video has its greatest length, and takes no more pictures."""
-        return self.seconds >= LONGEST
-
-    def add(self, time: float, picture: np.ndarray) -> None:
-        """Add a picture, uint8 (H, W, 3), at a simulated time [s]; it gets the size of the first."""
-        with self._lock:
-            if not self._done and not self.full:
-                self._add(time, picture)
-
-    def _add(self, time: float, picture: np.ndarray) -> None:
-        if self._size is None:
-            self._start, self._size = time, picture.shape
-        if picture.shape != self._size:
-            picture = np.asarray(Image.fromarray(picture).resize((self._size[1], self._size[0])))
-        assert self._start is not None
-        wanted = int((time - self._start) * FPS) + 1
-        if wanted < self._frames:  # the simulation went back to rest: go on from there
-            self._start, wanted = time - self._frames / FPS, self._frames + 1
-        while self._frames < wanted:
-            early = self._last if wanted - self._frames > 1 else None
-            self._encoder.write(picture if early is None else early)
-            self._frames += 1
-        self._last = picture
-
-    def finish(self) -> bytes:
-        """The video as .mp4."""
-        with self._lock:
-            self._done = True
-        try:
-            if self._frames == 0:
-                raise ValueError("Nothing was recorded, as nothing moved: go on before you record.")
-            self._encoder.finish()
-            return self._path.read_bytes()
-        finally:
-            self._encoder.abort()
-            self._folder.cleanup()

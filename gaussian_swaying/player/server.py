@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-import numpy as np
 import torch
 from aiohttp import WSMsgType, web
 from PIL import Image
@@ -36,7 +35,7 @@ from gaussian_swaying.player.film.page import PAGE, bundled, filled, in_steps, m
 from gaussian_swaying.player.film.recorded import STEPS, Film, film_without_frames, first_view, look_of
 from gaussian_swaying.player.painting import FILE, TOGETHER, Painting
 from gaussian_swaying.player.panel import Panel
-from gaussian_swaying.player.pictures import Eye, FilmStrip, PictureSize, draw, enlarged, under_cursor
+from gaussian_swaying.player.pictures import Eye, PictureSize, draw, under_cursor
 from gaussian_swaying.player.session import Session, Snapshot, settings_of_splat
 from gaussian_swaying.rendering.shading import DiffuseShader
 from gaussian_swaying.rendering.tints import by_role
@@ -90,13 +89,7 @@ class Door:
         self.token = None if host in LOCAL else secrets.token_urlsafe(16)
 
     def refusal(self, headers: Mapping[str, str], given: Sequence[str] = (), address: str = "") -> str | None:
-        """The reason why a request is refused, or None.
-
-        Args:
-            headers: Of the request.
-            given: The tokens in its link and in its cookie.
-            address: Address of this computer at which the request arrived.
-        """
+        """The reason why a request is refused, or None."""
         asked, origin = headers.get("Host") or "", headers.get("Origin")
         try:
             name = urlsplit(f"//{asked}").hostname or ""
@@ -130,8 +123,6 @@ def colour_message(simulation: Simulation, film: Film, roles: Tensor, known: Ten
     Their places in the film (uint32), and red, green and blue of each (uint8).
 
     Args:
-        simulation: The simulation.
-        film: Its Gaussians at rest.
         roles: Their roles in the splat, see :func:`~gaussian_swaying.rendering.tints.by_role`, shape (N,).
         known: The same before.
     """
@@ -153,7 +144,6 @@ def state_message(snapshot: Snapshot, ended: bool) -> bytes:
     """The displacement of the nodes of a state: 6 bytes each, and 16 more for one that moved far.
 
     Args:
-        snapshot: The snapshot.
         ended: Whether no other state follows for now.
     """
     simulation, scene = snapshot.simulation, snapshot.simulation.scene
@@ -257,9 +247,6 @@ class Server:
         self._making: asyncio.Future[Any] | None = None  # another one, for all browsers
         self._upload: tempfile.TemporaryDirectory[str] | None = None  # where the splat lies that was loaded
         self._loading = False
-        self._recording: FilmStrip | None = None
-        self._recorder: Client | None = None  # from whose camera it is recorded
-        self._video = b""
         self._texts: tuple[float, Any, dict[str, Any]] = (-1.0, None, {})  # when, the settings, and what was told
         self._work, self._draw = ThreadPoolExecutor(1, "work"), ThreadPoolExecutor(1, "draw")
         self._closing = threading.Event()
@@ -415,7 +402,7 @@ class Server:
 
     async def _save(self, request: web.Request) -> web.Response:
         name = request.match_info["name"]
-        made = {"live.yaml": self._configuration, FILE: self._parts, "wind.mp4": lambda: self._video}.get(name)
+        made = {"live.yaml": self._configuration, FILE: self._parts}.get(name)
         if made is None or self.session is None:
             raise web.HTTPNotFound
         content = await self._loop.run_in_executor(self._work, made)
@@ -513,8 +500,6 @@ class Server:
         finally:
             feeding.cancel()
             self.clients.remove(client)
-            if self._recorder is client:
-                await self._record(client)
         return connection
 
     async def _hear(self, client: Client, said: dict[str, Any]) -> None:
@@ -548,8 +533,6 @@ class Server:
             await self._aside(self.painting.paint, str(id(client)), said)
         elif kind in ("take_back", "apply"):
             await self._aside(getattr(self.painting, kind))
-        elif kind == "record":
-            await self._record(client)
         client.wake.set()
 
     async def _aside(self, what: Callable[..., Any], *given: Any) -> Any:
@@ -567,12 +550,8 @@ class Server:
     async def _grab(self, client: Client, session: Session, said: Mapping[str, Any]) -> None:
         frame = session.simulation.scene.frame
         origin = self._place(said["eye"])
-        ray = [
-            b - a
-            for a, b in zip(
-                origin, self._place([sum(x) for x in zip(said["eye"], said["ray"], strict=True)]), strict=True
-            )
-        ]
+        end = self._place([sum(x) for x in zip(said["eye"], said["ray"], strict=True)])
+        ray = [b - a for a, b in zip(origin, end, strict=True)]
 
         def find() -> list[float] | None:
             with session.lock:
@@ -583,20 +562,6 @@ class Server:
             session.grab(place)
             place = frame.point_to_sim(torch.tensor(place, dtype=torch.float64)).tolist()
         await client.say({"kind": "grabbed", "token": int(said["token"]), "place": place})
-
-    async def _record(self, client: Client) -> None:
-        """Begin a video from the camera of a browser, or end the one that is being recorded."""
-        if self._recording is None:
-            self._recording, self._recorder = FilmStrip(), client
-            return
-        film, recorder = self._recording, self._recorder
-        self._recording = self._recorder = None
-        content = await self._aside(film.finish)
-        if film.full:
-            self.tell(f"The video has the greatest length, {film.seconds:.0f} s, and was saved.")
-        if recorder in self.clients and recorder is not None:
-            self._video = content
-            await recorder.say({"kind": "file", "name": "wind.mp4"})
 
     # ---- what it gets
 
@@ -636,7 +601,7 @@ class Server:
         session = self.session
         if session is not None:
             with suppress(Exception):  # a moment in which a scene is replaced
-                rates, health = session.rates(), session.snapshot.health
+                health = session.snapshot.health
                 elsewhere = self.door.token is not None
                 found["panel"] = {"groups": self.panel.groups(), "legends": self.panel.legends()}
                 found["panel"] |= {"together": list(TOGETHER), "elsewhere": elsewhere}
@@ -645,19 +610,17 @@ class Server:
                 found["panel"] |= self._first[1]
                 found["painting"] = self.painting.shown()
                 figures |= {"paused": session.paused, "speed": session.speed, "broken": session.broken}
-                figures |= {"problem": session.problem, "undo": session.changes, "rate": rates.real_time}
+                figures |= {"problem": session.problem, "undo": session.changes, "rate": session.rate()}
                 figures |= {"pictures": round(max((one.rate for one in self.clients), default=0.0))}
-                figures |= {"time": health.time, "substeps": rates.substeps, "step": rates.step}
+                figures |= {"time": health.time, "substeps": health.substeps, "step": session.simulation.frame_dt}
                 figures |= {"stretch": [health.stretch_min, health.stretch_max], "held": session.pulls}
-                figures["recorded"] = None if self._recording is None else self._recording.seconds
         self._texts = (now, settings, found)
         return found
 
     async def _send(self, client: Client, session: Session) -> None:
         """Send what a browser lacks of the newest snapshot: the scene, light, colours, and the state, or a picture."""
         snapshot, still = session.snapshot, session.paused or session.broken
-        recorded = self._recording is not None and self._recorder is client
-        if client.show != "color" or client.server or recorded or not drawable(snapshot):
+        if client.show != "color" or client.server or not drawable(snapshot):
             await self._send_picture(client, session, snapshot, still)
             return
         key = (snapshot.simulation, snapshot.simulation.scene)
@@ -711,9 +674,6 @@ class Server:
         client.state, client.scene = state, None
         jpeg = await self._loop.run_in_executor(self._draw, self._picture, client, eye, session, snapshot, still)
         await client.say(message({"kind": "picture", "time": snapshot.health.time}, jpeg))
-        film = self._recording
-        if film is not None and film.full and self._recorder is client:
-            await self._record(client)
 
     def _picture(self, client: Client, eye: Eye, session: Session, snapshot: Snapshot, still: bool) -> bytes:
         width, height = client.size.fit(*eye.size, still)
@@ -725,12 +685,8 @@ class Server:
             )
         if not still:
             client.size.took(time.perf_counter() - began)
-        picture = enlarged(picture, *client.size.fit(*eye.size, still=True))
-        film = self._recording
-        if film is not None and self._recorder is client:
-            film.add(snapshot.health.time, np.ascontiguousarray(picture))
         stream = io.BytesIO()
-        Image.fromarray(np.ascontiguousarray(picture)).save(stream, "JPEG", quality=JPEG_QUALITY)
+        Image.fromarray(picture).save(stream, "JPEG", quality=JPEG_QUALITY)
         return stream.getvalue()
 
 

@@ -49,8 +49,6 @@ def changed_settings(parser: ArgumentParser, settings: Namespace, values: Mappin
     """Settings with other values. Parameters are checked and set; only other fields are parsed anew.
 
     Args:
-        parser: From :meth:`Simulation.parser`.
-        settings: Settings from it.
         values: New values by the names of their fields, with dots, or of parameters.
     """
     numbers = {name: value for name, value in values.items() if find(name) is not None}
@@ -80,12 +78,6 @@ def take(simulation: Simulation, parser: ArgumentParser, settings: Namespace, va
 
     Parameters, the wind, aerodynamic coefficients, shading, background and length of a frame change in motion; the
     material only if it is the same everywhere.
-
-    Args:
-        simulation: The simulation.
-        parser: From :meth:`Simulation.parser`.
-        settings: The settings with all changes.
-        values: New values of numbers by their names, and the other fields that have changed, with dots.
 
     Returns:
         False if another field has changed, so that the simulation has to be made anew.
@@ -149,8 +141,6 @@ class Pull(Force):
         """Make a pull on the particles around a place.
 
         Args:
-            scene: The simulated scene.
-            state: Its state now.
             place: The place [scene units].
         """
         position, mass = state.position.detach(), scene.points.mass
@@ -190,8 +180,6 @@ class Snapshot:
     """The simulation, its state and its measurements at one time.
 
     Attributes:
-        simulation: The simulation.
-        state: Its state.
         health: Measurements at the end of the last step.
         number: Counts the snapshots of a session.
         motion: Counts the motions of a session: another one begins at rest.
@@ -202,23 +190,6 @@ class Snapshot:
     health: FrameDiagnostics
     number: int
     motion: int = 0
-
-
-@dataclass(frozen=True)
-class Rates:
-    """The speed of a session.
-
-    Attributes:
-        steps: Steps per second.
-        real_time: Simulated seconds per second.
-        step: Length of a step [s].
-        substeps: Substeps of the last step.
-    """
-
-    steps: float
-    real_time: float
-    step: float
-    substeps: int
 
 
 @dataclass
@@ -252,13 +223,8 @@ def settings_of_splat(
     """The settings that the preview suggests for a splat.
 
     Args:
-        parser: From :meth:`Simulation.parser`.
-        path: The splat.
-        device: Device of the simulation.
         folder: Gets ``parts.npz``, which the settings name, if the splat has parts.
-        further: Options that replace what is suggested.
         tell: Called with the share that is done, from 0 to 1, and the name of the next task.
-        quick: Whether the grid is a coarser one than that of its starter.
     """
     tell(0.05, "Reading the splat")
     with spare_memory(SPARE):
@@ -352,9 +318,7 @@ class Session:
         """Go on with another scene, from rest.
 
         Args:
-            settings: Its settings.
             done: Called in the thread of the session once the scene is there; not if it cannot be made.
-            ended: Called there in both cases.
         """
 
         def take_scene() -> None:
@@ -435,17 +399,16 @@ class Session:
         """The configuration as it is now; ``gaussian-swaying sim --config`` starts from it."""
         return config_text(self.parser, self.settings)
 
-    def rates(self) -> Rates:
+    def rate(self) -> float:
+        """Simulated seconds per second, lately."""
         steps, now = list(self._steps), time.perf_counter()
         steps = [step for step in steps if now - step[0] < WINDOW]
-        health, simulation = self.snapshot.health, self.simulation
         if len(steps) < 2:
-            return Rates(0.0, 0.0, simulation.frame_dt, health.substeps)
+            return 0.0
         between = steps[-1][0] - steps[0][0]
         overdue = now - steps[-1][0] - between / (len(steps) - 1)  # a step that is under way is not late yet
         took = max(between + max(overdue, 0.0), 1e-6)
-        passed = steps[-1][1] - steps[0][1]
-        return Rates((len(steps) - 1) / took, passed / took, simulation.frame_dt, health.substeps)
+        return (steps[-1][1] - steps[0][1]) / took
 
     # ---- in the thread
 
@@ -637,7 +600,6 @@ class Choice:
 
     Attributes:
         settings: The settings with it.
-        simulation: Their simulation.
         sentence: What was chosen, and how to get the configured grid.
     """
 
@@ -647,13 +609,7 @@ class Choice:
 
 
 def in_real_time(parser: ArgumentParser, settings: Namespace, simulation: Simulation) -> Choice:
-    """Choose the finest grid, not finer than the configured one, on which this machine keeps up with real time.
-
-    Args:
-        parser: From :meth:`Simulation.parser`.
-        settings: The settings as they were configured.
-        simulation: Their simulation.
-    """
+    """Choose the finest grid, not finer than the configured one, on which this machine keeps up with real time."""
     configured = float(settings.solver.dx)
     made = {configured: (settings, simulation)}
     frames = 1 + max(1, round(MOTION / simulation.frame_dt))
@@ -678,7 +634,6 @@ def finest_within(
 
     Args:
         cost: Cost for a grid spacing [m]; ValueError where the grid is too coarse for the scene, such as for a pin.
-        wish: The largest cost.
         configured: Smallest grid spacing [m]; its errors are raised.
         coarsest: Largest grid spacing [m]; if it is less than ``configured``, that one is kept.
     """
@@ -718,7 +673,6 @@ def sentence(configured: float, chosen: float, configured_speed: float, speed: f
         configured: Its spacing [m].
         chosen: Spacing of the grid that was chosen [m].
         configured_speed: Simulated seconds per second on the configured grid.
-        speed: The same on the one that was chosen.
     """
     fast = f"predicted to run at {speed:.2g} x real time here"
     if chosen == configured:

@@ -14,10 +14,6 @@ from gaussian_swaying.runs.saved import load_plain
 def log_lines(log: Sequence[Mapping[str, float]], known: list[str]) -> list[str]:
     """A log of frames as a checkpoint stores it: a line of JSON per frame.
 
-    Args:
-        log: Diagnostics of all frames so far.
-        known: The lines of the first of them; the others are appended, so that each is made once.
-
     Returns:
         A copy of ``known``.
     """
@@ -29,7 +25,6 @@ def read_checkpoint(path: Path, config: str = "") -> dict[str, Any]:
     """Read a checkpoint; no code in it is executed.
 
     Args:
-        path: ``checkpoint.pt`` of a run.
         config: The configuration with which it must have been written; "" for any.
 
     Returns:

@@ -21,7 +21,6 @@ def frame_folder(render: str = "color", camera: str = "") -> str:
     """Folder of a render's frames inside that of the run: ``frames``, ``depth``, ``cameras/<name>/frames`` ...
 
     Args:
-        render: The name of a pass.
         camera: Name of a further camera; empty for the main camera.
     """
     own = "frames" if render == "color" else render

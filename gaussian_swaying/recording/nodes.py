@@ -46,9 +46,6 @@ def load_nodes(path: str | os.PathLike[str]) -> Tensor:
     """Displacement of the recorded nodes [m, z up] in all frames, float32, shape (frames, nodes, 3).
 
     The nodes are those of :meth:`~gaussian_swaying.mpm.embedded.EmbeddedPoints.nodes`.
-
-    Args:
-        path: ``nodes.npz`` of a run of ``total``.
     """
     with np.load(check_archive(path, "the run")) as arrays:
         count = len(arrays.files) // len(NODES)

@@ -21,9 +21,6 @@ def tell_missing(folder: Path, suffix: str, frames: Iterable[int], film: str | N
     """A sentence if files of frames are missing.
 
     Args:
-        folder: Where they are.
-        suffix: Ending of their names.
-        frames: Numbers of the frames.
         film: Name of the file made from them, if any.
     """
     paths = (folder / f"{index:05d}{suffix}" for index in sorted(frames))

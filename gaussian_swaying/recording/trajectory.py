@@ -25,7 +25,6 @@ def pack_trajectory(shards: Path, target: Path, frames: int) -> None:
     Args:
         shards: Folder with an .npz per frame, ``00000.npz`` ...; removed at the end.
         target: The file; frames that are only in an existing file with this name are kept.
-        frames: Number of frames to keep.
     """
     wanted = {f"{index:05d}" for index in range(frames)}
     own = sorted(shards.glob("[0-9]*.npz"), reverse=True)  # they replace those of the earlier run

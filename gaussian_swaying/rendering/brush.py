@@ -43,7 +43,6 @@ def seen(means: Tensor, covariances: Tensor, camera: Camera, picture: RenderOutp
     Args:
         means: Centres [scene units], shape (N, 3).
         covariances: Their covariances [scene units²], shape (N, 3, 3).
-        camera: The camera, with the size of the screen.
         picture: A picture of them from there, which may have fewer pixels.
         slack: See there [scene units].
 
@@ -89,10 +88,8 @@ def touched(view: Seen, path: Tensor, radius: float, through: bool = False) -> T
     """The Gaussians whose centres a brush touches that follows a path, their indices, rising, int64, shape (M,).
 
     Args:
-        view: The Gaussians on the screen.
         path: Corners of the path [pixels], shape (S, 2); the brush goes straight from one to the next.
         radius: Radius of the brush [pixels].
-        through: Whether it touches those that are hidden, too.
     """
     check_shape("path", path, None, 2)
     check_positive("radius", radius)

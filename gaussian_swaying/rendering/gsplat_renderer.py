@@ -152,7 +152,6 @@ def render_gsplat(
         covariances: Symmetric covariances [scene units^2], shape (N, 3, 3).
         opacities: Opacities in [0, 1], shape (N,).
         colors: Colours as displayed, shape (N, 3).
-        camera: The camera.
         background: Colour behind the Gaussians, shape (3,); black when None.
         eps2d: Added to the diagonal of the projected covariances [pixels^2].
 
@@ -218,7 +217,6 @@ def rasterize_splat(
         scales: Standard deviations [scene units], shape (N, 3).
         opacities: Opacities in [0, 1], shape (N,).
         sh: Coefficients of real spherical harmonics, shape (N, K, 3).
-        camera: The camera, on the same device.
         background: Colour behind the Gaussians, shape (3,); black when None.
         eps2d: Added to the diagonal of the projected covariances [pixels^2].
         channels: Further values to blend behind the colours, over zero, shape (N, E).
@@ -344,10 +342,6 @@ def make_renderer(device: torch.device | str, detail: float = 0.0) -> SplatRende
     """Return the renderer for a device: gsplat with CUDA, the torch renderer otherwise.
 
     If gsplat cannot compile its kernels (no ``nvcc``), the torch renderer draws on the GPU, with a warning.
-
-    Args:
-        device: The device.
-        detail: See :class:`~gaussian_swaying.rendering.torch_renderer.TorchRenderer`; gsplat draws all Gaussians.
     """
     if torch.device(device).type != "cuda" or not torch.cuda.is_available():
         return TorchRenderer(detail=detail)

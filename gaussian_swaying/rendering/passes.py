@@ -46,8 +46,6 @@ def depth_colors(depth: Tensor, near: float | Tensor, far: float | Tensor) -> Te
 
     Args:
         depth: Depth, 0 for empty pixels, shape (H, W).
-        near: Nearest depth of the scale.
-        far: Farthest depth of the scale.
 
     Returns:
         Shape (H, W, 3).

@@ -47,7 +47,6 @@ def plane_channels(means: Tensor, quats: Tensor, log_scales: Tensor, camera: Cam
         means: Centres [scene units], shape (N, 3).
         quats: Quaternions wxyz of any length above zero, shape (N, 4).
         log_scales: Logarithm of the standard deviations [scene units], shape (N, 3).
-        camera: The camera, on the device and in the precision of ``means``.
 
     Returns:
         Normals in the frame of the camera and n.x, shape (N, 4). Differentiable in ``means`` and ``quats``.
@@ -78,7 +77,6 @@ def surface_maps(channels: Tensor, alpha: Tensor, camera: Camera, least_alpha: f
     Args:
         channels: Blended channels, shape (H, W, 4).
         alpha: Rendered opacity, shape (H, W, 1).
-        camera: The camera, on the device and in the precision of ``channels``.
         least_alpha: A pixel with less opacity shows no surface.
 
     Returns:
@@ -105,7 +103,6 @@ def depth_normals(depth: Tensor, known: Tensor, camera: Camera) -> tuple[Tensor,
     Args:
         depth: Depth along the optical axis [scene units], shape (H, W, 1).
         known: Whether a pixel shows a surface, bool (H, W, 1).
-        camera: The camera.
 
     Returns:
         Unit normals towards the camera, shape (H, W, 3), and where they are defined, bool (H, W, 1): not at the border

@@ -59,7 +59,6 @@ class Renderer(Protocol):
             covariances: Symmetric covariances [scene units^2], shape (N, 3, 3).
             opacities: Opacities after the sigmoid, in [0, 1], shape (N,).
             colors: Colours as displayed (no spherical harmonics), shape (N, 3).
-            camera: The camera, on any device and in any precision.
             background: Colour behind the Gaussians, shape (3,); black when None.
 
         Returns:
@@ -138,7 +137,6 @@ class SplatRenderer(Renderer, Protocol):
             log_scales: Logarithm of the standard deviations [scene units], shape (N, 3).
             opacities: Opacities after the sigmoid, in [0, 1], shape (N,).
             sh: Spherical harmonics coefficients, shape (N, K, 3) with K = 1, 4, 9 or 16.
-            camera: The camera, on any device and in any precision.
             background: Colour behind the Gaussians, shape (3,); black when None.
             channels: Further values of each Gaussian to blend in the same pass, shape (N, E).
 

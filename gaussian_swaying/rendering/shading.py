@@ -55,8 +55,6 @@ def diffuse_shading(
         ambient: Share a of ambient light, in [0, 1].
         rest_normal: Unit normals of the rest shape, shape (..., 3), for shading relative to it.
         view_direction: Unit vectors from the surface to the eye, in the same frame, shape (..., 3); for a highlight.
-        specular: Coefficient k_s of the highlight.
-        shininess: Exponent :math:`\alpha` of the highlight.
 
     Returns:
         Shaded colours, not negative, shape (..., 3).

@@ -45,7 +45,6 @@ def thinned(
         covariances: Symmetric covariances [scene units^2], shape (N, 3, 3).
         opacities: Opacities in [0, 1], shape (N,).
         colors: Colours, shape (N, 3).
-        camera: The camera, on the device and in the precision of ``means``.
         detail: The size d [pixels].
         eps2d: Added to the diagonal of the projected covariances [pixels^2].
 

@@ -72,7 +72,6 @@ def project_gaussians(
         means: Centres [scene units], shape (N, 3).
         covariances: Symmetric covariances [scene units^2], shape (N, 3, 3).
         opacities: Opacities in [0, 1], shape (N,).
-        camera: The camera, on the device and in the precision of ``means``.
         eps2d: Added to the diagonal of the projected covariances [pixels^2].
 
     Returns:
@@ -199,7 +198,6 @@ def composite_gaussians(
     on the CPU.
 
     Args:
-        projected: Gaussians from :func:`project_gaussians`.
         features: Values to blend, shape (V, D).
         width: Image width [pixels].
         height: Image height [pixels].
@@ -276,7 +274,6 @@ def render_torch(
         covariances: Symmetric covariances [scene units^2], shape (N, 3, 3).
         opacities: Opacities in [0, 1], shape (N,).
         colors: Colours as displayed, shape (N, 3).
-        camera: The camera.
         background: Colour behind the Gaussians, shape (3,); black when None.
         eps2d: Added to the diagonal of the projected covariances [pixels^2].
         max_pairs: Approximate number of pairs of a Gaussian and a pixel in memory at a time.

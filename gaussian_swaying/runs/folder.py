@@ -23,7 +23,6 @@ def claim_folder(folder: Path, ours: Iterable[str], remedy: str, in_use: Iterabl
     A symbolic link is followed: its target is moved and made again, and the link does not change.
 
     Args:
-        folder: The folder.
         ours: Names in it that a run writes. The folder is refused if something else made one of them.
         remedy: A remedy for the user, for the messages, such as "choose another with --output".
         in_use: Files and folders that the new run reads, which must not be moved.

@@ -26,7 +26,6 @@ def load_plain(path: Path, map_location: Any = "cpu") -> Any:
     """Read a file of :func:`save_whole`.
 
     Args:
-        path: The file.
         map_location: Device of its tensors, as for ``torch.load``.
     """
     try:

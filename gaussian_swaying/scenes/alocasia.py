@@ -19,8 +19,6 @@ def alocasia(spacing: float = 0.005, count: int = 8, seed: int = 0, size: float 
 
     Args:
         spacing: Distance between Gaussians [m].
-        count: Number of leaves.
-        seed: Seed of the growth.
         size: Radius of a floor without shadows and with small Gaussians, where copies can stand [m]; 0 for the floor of
             one plant.
     """

@@ -20,8 +20,6 @@ def ficus(spacing: float = 0.008, count: int = 2400, seed: int = 0) -> GaussianC
     Args:
         spacing: Distance between Gaussians [m]; a leaf has at least one. On the trunk and branches it is at most 3 and
             4.5 cm, so that they stay stiff on a coarse grid.
-        count: Number of leaves.
-        seed: Seed of the growth.
     """
     h, draw = spacing, Draw(seed)
     bark = (0.42, 0.33, 0.25)

@@ -26,8 +26,6 @@ def leafy_branch(spacing: float = 0.006, count: int = 150, seed: int = 0) -> Gau
 
     Args:
         spacing: Distance between Gaussians [m]; a leaf has at least one.
-        count: Number of leaves.
-        seed: Seed of the growth.
     """
     h, draw = spacing, Draw(seed)
     ends = torch.tensor([piece[:2] for piece in WOOD], dtype=torch.float64)

@@ -83,7 +83,6 @@ def to_cloud(
     """One Gaussian per patch.
 
     Args:
-        patches: Surface.
         overlap: Standard deviation of a Gaussian as a share of the edge of its patch.
         ambient: Share of ambient light in the baked light, in [0, 1].
         two_sided: Bake the same light into both sides, as for leaves and cloth.
@@ -136,8 +135,6 @@ def sheet(
 
     Args:
         surface: Point (..., 3) of v and u, both in [0, 1] of shape (...). The outside is on the side of du x dv.
-        rows: Patches along v.
-        columns: Patches along u.
         colour: RGB in [0, 1].
 
     Returns:
@@ -277,7 +274,6 @@ def copies(template: Patches, axes: Tensor, size: Tensor, origin: Tensor, tint: 
     """One template placed many times.
 
     Args:
-        template: T patches.
         axes: Rotation of each copy, shape (M, 3, 3).
         size: Factor on its lengths, shape (M,).
         origin: Position of each copy's origin [m], shape (M, 3).

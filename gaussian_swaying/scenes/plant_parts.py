@@ -46,12 +46,8 @@ def leaf(
         length: Length [m].
         width: Largest width [m].
         spacing: Distance between Gaussians [m]; a leaf has at least one Gaussian.
-        taper: The exponents p and q.
         droop: Distance of the tip below the plane, as a share of the length.
         fold: Height of the rim above the midrib, as a share of the half width.
-        colour: RGB of the blade.
-        vein: RGB of the midrib and the side veins.
-        veins: Pairs of side veins to draw.
 
     Returns:
         The patches, row by row.
@@ -95,7 +91,6 @@ def pot(
         foot: Radius at the bottom [m].
         rim: Radius at the top [m].
         spacing: Distance between Gaussians [m].
-        colour: RGB of the pot.
 
     Returns:
         The patches; the soil is at 0.92 of the height.

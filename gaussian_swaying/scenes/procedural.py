@@ -34,7 +34,6 @@ class ProceduralScene(Fixed, ABC):
         """Raise ValueError unless ``spacing`` and the named numbers are positive.
 
         Args:
-            positive: Names of the numbers.
             coarsest: Largest spacing that resolves the scene [m].
         """
         given = vars(self)

@@ -52,8 +52,6 @@ def sand_bear(spacing: float = 0.013, seed: int = 0, interior: bool = True) -> G
 
     Args:
         spacing: Distance between Gaussians [m], on the surface and inside.
-        seed: Seed of the jitter.
-        interior: Fill the inside.
     """
     h, draw = spacing, Draw(seed)
     xs = torch.arange(-1.05, 1.05, h, dtype=torch.float64) + 0.5 * h

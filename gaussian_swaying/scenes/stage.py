@@ -33,8 +33,6 @@ def floor(
 
     Args:
         spacing: Distance between Gaussians near the middle [m], which grows with the distance from it.
-        colour: RGB near the middle.
-        shadows: Soft round shadows.
         flat: Radius within which the distance between Gaussians does not grow [m], so that none covers an object there.
         fade: Distances from the middle at which the fading starts and ends [m].
         ambient: That of :func:`~gaussian_swaying.scenes.patches.to_cloud`; the colours make up for its light at the

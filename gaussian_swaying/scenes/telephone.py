@@ -32,7 +32,6 @@ def telephone(spacing: float = 0.004, count: int = 16) -> GaussianCloud:
 
     Args:
         spacing: Distance between Gaussians along the cord [m]; elsewhere at least 8 mm.
-        count: Turns of the coil.
     """
     coarse = min(max(spacing, 0.008), 0.04)
     parts = [_wall(coarse), *_body(coarse), *handset(coarse), cord(spacing, count)]

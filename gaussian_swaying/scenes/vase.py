@@ -33,8 +33,6 @@ def vase(spacing: float = 0.004, count: int = 15, seed: int = 0) -> GaussianClou
 
     Args:
         spacing: Distance between Gaussians [m].
-        count: Number of flowers.
-        seed: Seed of the bunch.
     """
     h, draw = spacing, Draw(seed)
     profile = bezier([[0.055, 0, 0.0], [0.16, 0, 0.05], [0.13, 0, 0.20], [0.02, 0, 0.22], [0.065, 0, 0.30]])

@@ -19,9 +19,6 @@ def plant_row(spacing: float = 0.012, count: int = 60, seed: int = 0, plants: in
 
     Args:
         spacing: Distance between Gaussians [m]; a leaf has at least one.
-        count: Leaves of a plant.
-        seed: Seed of the growth.
-        plants: Number of plants.
     """
     draw = Draw(seed)
     places = [(k - 0.5 * (plants - 1)) * 0.6 for k in range(plants)]

@@ -476,7 +476,6 @@ def narrow(points: Tensor, dx: float, moved: float) -> list[str]:
     Args:
         points: Rest positions of the points of a body that is not filled [m], shape (P, 3).
         dx: Grid spacing [m].
-        moved: Largest displacement over the longest side.
     """
     if len(points) < _FEW or not moved > BENT:
         return []
@@ -531,7 +530,6 @@ def suggest_spacing(longest_side: float, spacing: float, cells: int) -> float:
     Args:
         longest_side: Longest side of the object [m].
         spacing: From :func:`~gaussian_swaying.geometry.neighbours.particle_spacing` [m].
-        cells: Cells along the longest side.
 
     Returns:
         Grid spacing [m].
@@ -555,8 +553,6 @@ def attached_samples(
     Args:
         position: Rest positions [m], those of the Gaussians first, then extra points, shape (N, 3).
         normal: Unit normals, shape (N, 3).
-        count: Number of Gaussians.
-        parts: The parts of the splat.
         labels: The part of each Gaussian, shape (count,).
 
     Returns:
@@ -667,7 +663,6 @@ def joints_of(
     """The joints of parts.
 
     Args:
-        parts: The parts.
         labels: The part of each simulated Gaussian, shape (N,).
         place: Their rest positions [m], shape (N, 3).
         owner: The material point that each belongs to, shape (N,).
@@ -710,7 +705,6 @@ def with_parts(scene: Scene, cloud: GaussianCloud, material: Material, solver: S
 
     Args:
         scene: The scene, all in scene units.
-        cloud: Its Gaussians.
         material: Its ``regions`` come after those of the parts, and win.
         solver: Gets a body for each part that is rigid, and a pin for all that are held, which holds nodes of the grid.
 
@@ -850,10 +844,8 @@ def sample_object(
         body_area: Areas that carry material [m²], shape (S,).
         area: Areas that feel the wind [m²], shape (S,).
         filling: Samples inside a solid, if there are any.
-        material: The material of the object.
         frame: Conversion from scene units to metres.
         dx: Grid spacing [m], for ``material.volume = "cell"``.
-        layers: Layers of points through the thickness of a sheet.
     """
     surface = torch.ones(len(position), dtype=torch.bool)
     if filling is not None:
@@ -944,13 +936,9 @@ def grouped(
     pieces, or the two sides of the border of a region in ``apart``.
 
     Args:
-        samples: The samples.
         dx: Grid spacing [m].
-        per_cell: Points along the side of a cell. An even number makes groups of twice that size, see
-            :func:`matched_points`.
         apart: Regions in scene units: those of pins and edits.
         frame: Conversion from scene units to metres.
-        dtype: Precision of the solver.
         piece: A number for each sample, the same for those that are attached in their cell, shape (N,); None if all
             are.
         home: The places by which they are grouped [m], shape (N, 3), if these are not their own.
@@ -1001,7 +989,6 @@ def shared_wind(samples: Samples, owner: Tensor, parent: Tensor) -> tuple[Tensor
     wrinkle. In a group of more directions, as in noisy captures, each patch does go to that point.
 
     Args:
-        samples: The samples of the object.
         owner: The point that each belongs to, shape (N,).
         parent: The group of each point, shape (P,).
 
@@ -1117,9 +1104,7 @@ def surface_of(samples: Samples, owner: Tensor, points: MaterialPoints, dx: floa
     """The surface of an object: one of its samples for each part of a cell, with a disc for those that it stands for.
 
     Args:
-        samples: The samples of the object.
         owner: A material point close to each, shape (N,).
-        points: The material.
         dx: Grid spacing [m].
         contact: Contact of the surface with itself; None if only obstacles count.
 
@@ -1192,8 +1177,6 @@ def still_distance(
         opacities: From 0 to 1, shape (N,).
         low: Lower corner of the grid [m], shape (3,).
         high: Upper corner of the grid [m], shape (3,).
-        cells: Cells along its longest side.
-        level: The density of the surface.
 
     Returns:
         The distance at the centres of the cells, negative where the density is higher; at most :data:`BAND` cells.
@@ -1245,7 +1228,6 @@ class Body:
     """Material points and patches, and the samples of the object that they stand for.
 
     Attributes:
-        points: The material.
         patches: What feels the wind.
         on_surface: Number of points on the surface, without those at the faces of a sheet.
         samples: Samples of the object: first one for each Gaussian, then extra ones, then those inside a solid.
@@ -1278,14 +1260,9 @@ def body_of(
     """Turn Gaussians into what a solver takes: samples, their areas and material, groups, patches.
 
     Args:
-        part: The simulated Gaussians.
         normals: Their unit normals, shape (N, 3).
-        scene: How they are sampled.
-        material: Their material.
         frame: Conversion from scene units to metres.
         dx: Length that the solver resolves [m].
-        dtype: Precision of the simulation.
-        by_grid: Whether samples are grouped.
         apart: Regions whose borders no group crosses, in scene units.
         labels: The part of each Gaussian, shape (N,), if the scene has parts.
 
@@ -1360,12 +1337,9 @@ def specks_of(
     """The simulated Gaussians that are not connected to the object, if ``scene.loose`` carries them.
 
     Args:
-        cloud: All Gaussians.
         simulated: Indices of those that are simulated, shape (N,).
-        scene: How they are sampled.
         frame: Conversion from scene units to metres.
         dx: Length that the solver resolves [m].
-        by_grid: Whether samples are grouped.
 
     Returns:
         Their indices, shape (M,).
@@ -1421,10 +1395,6 @@ def _shared_areas(*shape: Tensor, open_only: bool) -> Tensor:
     """Areas of overlapping patches (N,), computed on the CPU; if only the material or the grid has changed, the last.
 
     The simulations of a preview, a sweep or a fit have the same Gaussians.
-
-    Args:
-        shape: Means, normals, logarithms of scales, and opacities.
-        open_only: Whether they are weighted with :func:`openness`.
     """
     means, normals, log_scales, opacity = shape
     if len(means) == 0:
@@ -1633,7 +1603,6 @@ class SimulatedScene(nn.Module):
 
         Args:
             contact: Contact of the surface with itself; None for none.
-            obstacles: Obstacles of the solver.
         """
         body, self._body = self._body, None
         if body is None or (contact is None and not obstacles):
@@ -1650,7 +1619,6 @@ class SimulatedScene(nn.Module):
         Args:
             low: Lower corner of the box [m], shape (3,).
             high: Upper corner of the box [m], shape (3,).
-            cells: Cells along its longest side.
             level: Density of the surface, from 0 to 1.
         """
         still = torch.ones(len(self.model.means), dtype=torch.bool)

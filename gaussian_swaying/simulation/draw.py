@@ -123,7 +123,6 @@ class Painter(Fixed, nn.Module):
         """The camera of a frame, on the device and in the precision of the Gaussians; one copy, without waiting for it.
 
         Args:
-            frame: Frame number.
             name: Which of ``cameras``; empty for ``camera``.
         """
         means, path = self.scene.model.means, self.cameras[name] if name else self.camera
@@ -260,8 +259,6 @@ class Painter(Fixed, nn.Module):
         """The picture of a state from the camera of a frame.
 
         Args:
-            state: The state.
-            frame: Frame number.
             name: Which of ``cameras``; empty for ``camera``.
         """
         return self.picture(self.deformed(state), self.camera_at(frame, name))
@@ -281,8 +278,6 @@ def draw(
     """The picture of a state of :func:`~gaussian_swaying.simulation.step.step`.
 
     Args:
-        model: The model.
-        state: Its state.
         camera: In scene units.
         shader: Colours from normals and light; None keeps the colours of the splat.
         background: Background colour, in [0, 1].
@@ -409,8 +404,6 @@ def streaks(stepper: Stepper, state: State, camera: Camera) -> tuple[Tensor, Ten
     and are as long as the air flows in a fixed time: an eighth of the picture at the speed of the flow.
 
     Args:
-        stepper: The stepper of the simulation.
-        state: The state.
         camera: The camera, in scene units.
 
     Returns:
@@ -716,11 +709,7 @@ def frames_from(
     """The frames of a simulation from number ``first`` up to ``count``, with its edits.
 
     Args:
-        painter: Draws the scene.
-        editor: Changes it, and has its stepper.
         state: The state at rest if ``first`` is 0, otherwise the state of the frame before.
-        first: Number of the first frame.
-        count: Number of frames of the whole run.
         drawn: A stream on which the frames are drawn and recorded. The next frame is then simulated at the same time,
             so that the GPU does not wait for the host, and what is assigned between two frames applies from the next
             but one on.

@@ -149,11 +149,7 @@ class TearingGauge:
 
 
 def check_spacing(solver: Solver) -> None:
-    """Raise ValueError if most particles are isolated on the grid, so that no law could keep them together.
-
-    Args:
-        solver: A solver with its material.
-    """
+    """Raise ValueError if most particles are isolated on the grid, so that no law could keep them together."""
     position = solver.points.position.detach().reshape(-1, *solver.points.position.shape[-2:])[0]
     if len(position) < 16:  # a few may be isolated on purpose
         return
@@ -266,16 +262,10 @@ def measure(
     """Measure the health of a state, without waiting for the device.
 
     Args:
-        solver: The solver that made the state.
         state: The state at the end of the frame, of one scene or of a batch of shape (B,).
-        substeps: Substeps of the frame.
-        cfl: Largest Courant number of the frame.
-        tearing: Counts torn particles; none are counted without it.
         before: The state at the start of the frame, for the work of the wind and the forces on supports; they are zero
             without it.
         more: Further numbers to read with them, float64, shape (n,).
-        lift: The force that takes off the weight of carried air: its potential energy is part of that of gravity, and
-            its work none of the wind's.
     """
     start = state if before is None else before
     moved = torch.linalg.vector_norm(state.position - solver.points.position, dim=-1)
@@ -348,12 +338,6 @@ class Gauge:
         """As :func:`measure`, without counting torn particles.
 
         Args:
-            solver: The solver that made the state.
-            state: The state at the end of the frame.
-            substeps: Substeps of the frame.
-            cfl: Largest Courant number of the frame.
-            before: The state at the start of the frame.
-            more: Function of the state that computes further numbers.
             same: Key of all else that ``more`` depends on; another key makes another recording. None to record nothing.
             lift: As in :func:`measure`; it changes only with ``same``.
         """
@@ -438,7 +422,6 @@ def extremes(log: Sequence[Mapping[str, Any]], where: Tensor, size: float, elast
     """Return the largest displacement, compression and stretch over the frames of a run.
 
     Args:
-        log: Diagnostics of the frames, as from ``FrameDiagnostics.as_dict``.
         where: Rest positions of the particles [scene units], shape (P, 3).
         size: Longest side of the object [m].
         elastic: Which particles are elastic, shape (P,), None for all; the stretch of plastic materials means nothing.
@@ -472,9 +455,7 @@ def advice(found: Mapping[str, Any], E: float, thickness_matters: bool = True) -
     """Sentences on what went wrong with the shape of the object and what to change; none if all is well.
 
     Args:
-        found: From :func:`extremes`.
         E: Largest Young's modulus of the run [Pa].
-        thickness_matters: Whether ``material.thickness`` determines the volume.
 
     Returns:
         The sentences.
@@ -577,7 +558,6 @@ class RunProgress:
         """Note that a frame is done.
 
         Args:
-            substeps: Substeps that it took.
             moved: Mean distance of the particles from where they were at rest [m].
         """
         if self._usual is None and substeps > 0:

@@ -101,9 +101,7 @@ class Model:
     Attributes:
         scene: The scene at rest, with the material of its points.
         material: The material that was given.
-        wind: The wind.
         aero: The force of the wind on patches.
-        forces: The custom forces.
         solver: Numbers of the solver.
         method: The solver that was given, without a material: formulation, pins and obstacles.
         air: The box of computed air; None if the wind is given everywhere.
@@ -260,12 +258,7 @@ def _check_one_layer(model: Model) -> None:
 
 
 def in_settings(settings: Namespace, values: Mapping[str, Any]) -> None:
-    """Set numbers in parsed settings, which are changed.
-
-    Args:
-        settings: From the parser of a simulation.
-        values: Values by the names of the numbers.
-    """
+    """Set numbers in parsed settings, which are changed."""
     angles = {}
     for name, value in values.items():
         value = number(name).check(name, value)
@@ -384,7 +377,6 @@ def edited_points(points: MaterialPoints, inside: Tensor, edit: Edit, flowed: bo
     Args:
         points: The material of one scene, shapes (P, ·).
         inside: Which points are edited, bool, shape (P,).
-        edit: The change.
         flowed: Whether the points have already moved. After plastic flow, the elastic and the total deformation differ
             for good. If no plastic law is left, one of the other laws is set to keep both, and the plastic law stays in
             the list without particles, because the kernels check the list.
@@ -572,12 +564,7 @@ class Normalisation:
         """Components in scene units, from those in the normalised space, which stay as they are.
 
         Args:
-            scene: Its region is in turned axes.
-            material: Its regions are in the normalised space.
-            solver: Its boundaries are in the normalised space.
             camera: Converted by ``CameraPath.in_space``; most cameras are in scene units.
-            cameras: Further cameras, likewise.
-            edits: Their regions are in the normalised space.
             cloud: The Gaussians of the scene, if they have been read already.
 
         Returns:
@@ -636,7 +623,6 @@ def as_scene(source: SceneLike, up: Sequence[float] | None = None) -> Scene:
     """Make a scene from settings, a file, Gaussians or a scene made in code.
 
     Args:
-        source: The object to simulate.
         up: Direction that points up in it; z if None.
 
     Returns:

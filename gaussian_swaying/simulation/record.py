@@ -67,12 +67,7 @@ def _check_checkpoint(
 
 
 def run_health(stepper: Stepper, log: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Any], list[str]]:
-    """Find what moved and stretched most in a run, with sentences on what to change; none if all is well.
-
-    Args:
-        stepper: The stepper of the run.
-        log: Diagnostics of its frames.
-    """
+    """Find what moved and stretched most in a run, with sentences on what to change; none if all is well."""
     scene, points = stepper.scene, stepper.model.points
     where = scene.frame.point_to_scene(points.position.cpu().double())
     elastic = points.elastic
@@ -204,7 +199,6 @@ class Run:
         config: The resume key.
 
     Attributes:
-        files: What was written.
         log: Diagnostics of the frames.
     """
 
@@ -233,12 +227,6 @@ class Run:
     @torch.inference_mode()
     def whole(self, output: Path, resume: bool, settings: dict[str, Any], progress: bool) -> dict[str, Any]:
         """Run from rest, or from a checkpoint, to the end; see ``Simulation.run``.
-
-        Args:
-            output: Folder of the results.
-            resume: Continue the run found there.
-            settings: Further entries of the summary.
-            progress: Show a progress bar.
 
         Returns:
             The summary.
@@ -320,9 +308,6 @@ class Run:
         Args:
             status: ``complete``, or how the run ended.
             reason: Why, if it is not complete.
-            state: The last state.
-            done: Number of frames.
-            settings: Further entries of the summary.
 
         Returns:
             The summary.

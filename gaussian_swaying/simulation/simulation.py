@@ -633,10 +633,7 @@ def run_batch(
     There are no checkpoints: what is interrupted starts again.
 
     Args:
-        members: A simulation, and variants of it (``Simulation.variant``) that differ in wind and material.
         folders: Folder of each; None for one that is only simulated.
-        frames: Number of frames.
-        settings: Further entries of each summary.
 
     Returns:
         The summaries.

@@ -316,7 +316,6 @@ class Stepper:
         """Velocity of the air at places [m/s]: that of the computed air, or else that of the wind.
 
         Args:
-            state: The state.
             place: Places [m], shape (P, 3).
 
         Returns:
@@ -479,10 +478,6 @@ class Stepper:
     def take(self, model: Model, running: bool = False) -> State | None:
         """Go on with another material, wind or forces; the solver is bound again only if its part has changed.
 
-        Args:
-            model: The new model, of the one scene.
-            running: Whether there is a state from which to go on; else the next start binds the solver.
-
         Returns:
             The state at rest if the solver was bound again.
         """
@@ -512,9 +507,6 @@ class Stepper:
     def advance(self, state: State) -> tuple[State, FrameDiagnostics]:
         """Advance by one frame.
 
-        Args:
-            state: The state at the start of the frame.
-
         Returns:
             The state at its end, and its diagnostics.
         """
@@ -525,7 +517,6 @@ class Stepper:
         """Pass a frame to the device; ``launch(state).finish()`` is :meth:`advance`, and the host can work between.
 
         Args:
-            state: The state at the start of the frame.
             steps: Number of substeps, as several batches that are compared take; those that it needs if None.
 
         Returns:
@@ -543,15 +534,7 @@ class Stepper:
         state: State,
         parts: tuple[object, ...] | None,
     ) -> Measurement:
-        """Start measuring the frame from ``state`` to ``end``, and what the next frame needs.
-
-        Args:
-            end: The state at its end.
-            steps: Its substeps.
-            courant: Its largest Courant number.
-            state: The state at its start.
-            parts: From :func:`parts_of`.
-        """
+        """Start measuring the frame from ``state`` to ``end``, and what the next frame needs."""
         idle, ahead = self.idle, self._tearing is None and self.foresees
 
         def needs(at: State) -> Tensor:
@@ -581,12 +564,7 @@ class Stepper:
 
     @in_turn
     def substeps(self, state: State, parts: tuple[object, ...] | None = None) -> int:
-        """Return the number of substeps of the next frame, from waves in the material and drag on light patches.
-
-        Args:
-            state: The state at its start.
-            parts: From :func:`parts_of`; with it, what is known is not measured.
-        """
+        """Return the number of substeps of the next frame, from waves in the material and drag on light patches."""
         if self.solver.exact:
             return self.solver.substeps(state, self.frame_dt)
         if self.outlook is not None and self.outlook.holds(state, parts):
@@ -616,13 +594,7 @@ class Stepper:
         return force.samples(state, self.frame_dt / 4, 5)
 
     def roll(self, state: State, steps: int, margin: int = 0) -> tuple[State, Tensor]:
-        """Advance by one frame without checks; returns the state and the largest Courant number of the frame.
-
-        Args:
-            state: The state now.
-            steps: Number of substeps.
-            margin: Extra cells around the grid of ``updated``.
-        """
+        """Advance by one frame without checks; returns the state and the largest Courant number of the frame."""
         progress, fitted = self.progress, self.solver.fit_grid(state, self.frame_dt, margin)
         watch = None if progress is None else lambda done: progress.substep(done, steps)
         if self._air is not None:
@@ -671,7 +643,6 @@ def step(model: Model, state: State) -> State:
     numbers share what does not depend on them, so ``model.at("wind.speed", 9)`` may be another one in every frame.
 
     Args:
-        model: The model, such as ``simulation.model``.
         state: The state now, of :func:`start`, of this function, or of the simulation.
 
     Raises:
@@ -803,8 +774,6 @@ def needs_of(stepper: Stepper, state: State, winds: Tensor | None) -> Tensor:
     """Cells that the fastest wave crosses per second; rate of the drag [1/s] and speed of the wind [m/s]; float64.
 
     Args:
-        stepper: The stepper.
-        state: The state at the start of a frame.
         winds: Air velocities during the frame [m/s], shape (K, ...), from ``WindForce.samples``; None if the wind has
             no effect.
     """
@@ -897,7 +866,6 @@ class SceneEditor:
         """Apply edits now, whatever their time; if one is not possible, nothing changes.
 
         Args:
-            state: The state now.
             edits: The changes, in this order.
 
         Returns:
@@ -984,8 +952,6 @@ class SceneEditor:
         """Apply edits to the scene.
 
         Args:
-            edits: The changes.
-            flowed: See :func:`edited_points`.
             running: As for :meth:`Stepper.take`, whose result is returned.
         """
         scene = self.scene

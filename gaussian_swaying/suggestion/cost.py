@@ -35,7 +35,6 @@ class Cost:
 
     Attributes:
         device: The device on which it was measured.
-        particles: Material points.
         dx: Grid spacing [m].
         grid: Grid nodes along each axis.
         frames: Frames of the run.
@@ -79,8 +78,6 @@ def estimate_cost(
     frames before.
 
     Args:
-        simulation: The run.
-        frames: Number of frames of the run.
         startup_seconds: Time to prepare the run [s], if known.
         budget: Time for the frames that are timed [s], about.
         pictures: Whether pictures count, if the run makes some.

@@ -106,11 +106,8 @@ def kind_of(own: Gaussians, up: Array, end: str, sheet: bool, names: list[str], 
     """Guess the kind of a thing.
 
     Args:
-        own: The Gaussians that move.
         up: Up direction, a unit vector.
         end: Where it is held: ``top``, ``bottom``, ``side`` or ``none``.
-        sheet: Whether it is a sheet.
-        names: Names of its parts.
         leaf: Its leaves, if it has some.
 
     Returns:
@@ -164,8 +161,6 @@ def with_materials(found: FoundParts, kind: Kind, height: float) -> FoundParts:
     modulus, by which :mod:`~gaussian_swaying.suggestion.natural` tells them from leaves.
 
     Args:
-        found: The parts.
-        kind: What the whole is.
         height: Its height [m].
     """
 

@@ -68,8 +68,6 @@ class Moving:
 
     Attributes:
         simulated: Which they are, bool, shape (N,).
-        opacity_threshold: Smallest simulated opacity.
-        reason: In words.
         box: Lower and upper corner [scene units] of the region, or None for all of space.
         region: The region for a run; None for all of space.
         holes: Boxes inside it that are left out, as corners.
@@ -94,7 +92,6 @@ class Thing:
     Attributes:
         members: Indices of its Gaussians, shape (M,).
         low: Lower corner of its box [scene units].
-        high: Upper corner.
         reasons: What speaks for it, with its share of the score.
     """
 
@@ -139,8 +136,6 @@ class Photos:
     """The cameras of photos, and what follows from them.
 
     Attributes:
-        path: The capture.
-        cameras: Its cameras.
         eyes: Their positions [scene units], shape (C, 3).
         up: The up direction, if they were held level.
         focus: The point nearest to all optical axes [scene units], shape (3,); None if there is no common point.
@@ -211,11 +206,7 @@ def main_part(splat: Gaussians, ground: Array, cells: float, shown: Shown | None
     its box are cut out by smaller boxes, the largest first.
 
     Args:
-        splat: All Gaussians.
         ground: The floor, bool, shape (N,).
-        cells: Cells along the longest side, at least as large as two spacings: points in touching ones are connected.
-        shown: The object in photos, to which the result is limited; the part nearest to their common point counts most.
-        more: Whether there are more Gaussians far away.
     """
     among = np.ones(len(splat), bool) if shown is None else shown.mask
     own = splat[among]
@@ -263,15 +254,9 @@ def around_part(
     """The box around a connected part, without the floor and specks in it.
 
     Args:
-        splat: All Gaussians.
         part: The connected part of those that may be simulated; -1 of others, shape (N,).
-        main: The part that is simulated.
-        threshold: Smallest simulated opacity.
         ground: The floor, bool, shape (N,).
         cell: The box is half a cell larger [scene units].
-        cuts: Further regions that are left out.
-        words: Why it is this part.
-        more: Whether there are more Gaussians far away.
     """
     means, chosen = splat.means, part == main
     low, high = _padded(means[chosen], 0.5 * cell)
@@ -357,9 +342,7 @@ def survey(splat: Gaussians, up: Guess | None = None, cameras: Sequence[Camera] 
     - in the photos: how much of it lies in them, on average (up to 2), if their cameras are known.
 
     Args:
-        splat: All Gaussians.
         up: The up direction, if it was given.
-        cameras: Those of the photos.
 
     Returns:
         The parts, or None if it has no ground, or a single thing on a small one and no background: then it is an
@@ -431,8 +414,6 @@ def move_things(place: Place, splat: Gaussians, numbers: Sequence[int]) -> tuple
     """The Gaussians at most one longest side away from some things, bool, shape (N,), and which of them move.
 
     Args:
-        place: The parts of the splat.
-        splat: Its Gaussians.
         numbers: Of the things, from 1 on.
     """
     part, main = place.part.copy(), int(place.part.max()) + 1
@@ -488,7 +469,6 @@ def _ground(points: Array, size: float, up: Guess | None) -> tuple[Guess, Array,
     Args:
         points: Centres that are near, or a sample of them, shape (N, 3).
         size: Extent of the place [scene units].
-        up: The direction to try, instead of six.
 
     Returns:
         The guess, normal and offset of the plane; None if there is no ground.

@@ -78,10 +78,7 @@ def natural(simulation: Simulation, kind: Kind, flow: Tensor, intensity: float) 
     """Find the numbers of a kind for a scene, and give them to the simulation.
 
     Args:
-        simulation: The scene in the formulation ``modes``, with any stiffness, thickness and drag; it is changed.
-        kind: Its kind, no cloth.
         flow: Mean wind [m/s], z up, shape (3,).
-        intensity: Intensity of its turbulence.
 
     Raises:
         ValueError: If nothing holds it.
@@ -143,7 +140,6 @@ def cloth_start(simulation: Simulation, kind: Kind, size: Sequence[float]) -> fl
     """Time at which a typical stretch of the wind begins for a cloth [s], by its pendulum or flapping.
 
     Args:
-        simulation: The scene.
         kind: ``cloth`` or ``flag``.
         size: Sides of the cloth [m], z up.
     """

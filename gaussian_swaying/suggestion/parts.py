@@ -106,7 +106,6 @@ def labelled(splat: Gaussians, simulated: Array, size: float, found: Labels | No
     What is near the object, or faint and touches it, goes with it; others are around.
 
     Args:
-        splat: All Gaussians.
         simulated: Those of the object, bool, shape (N,).
         size: Height of the object [scene units].
         found: Labels of the object; the label after the last part is that of what is around it.
@@ -424,9 +423,6 @@ def swinging(own: Gaussians, up: Array, hook: Region, cell: float) -> Labels:
     """The parts of a thing that hangs: its upper end is held, a cord or neck below it bends, and the rest is rigid.
 
     Args:
-        own: Its Gaussians.
-        up: Up direction.
-        hook: The upper end.
         cell: Grid spacing [scene units].
     """
     height, held = own.means @ up, contains(hook, own.means)

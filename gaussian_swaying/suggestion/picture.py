@@ -43,7 +43,6 @@ def whole_box(splat: Gaussians, simulated: Array, outside: Array, cell: float) -
     """Box of the moving part and everything connected with it, at most one longest side larger on each side.
 
     Args:
-        splat: All Gaussians.
         simulated: The moving part, bool, shape (N,).
         outside: Gaussians that are not part of the object, such as a floor, bool, shape (N,).
         cell: Points in the same or in touching cells of this size are connected [scene units].
@@ -158,7 +157,6 @@ def preview_picture(
     """The scene at rest from the side of its camera and from 90 degrees to the left, with a legend.
 
     Args:
-        simulation: A run, which need not have started.
         height: Height of each view [pixels].
         whole: Corners of the box to show [scene units]; that of the whole object if None.
 
@@ -259,12 +257,6 @@ def roles_tinted(colours: Tensor, roles: Roles, tints: Sequence[tuple[str, Tenso
 @torch.no_grad()
 def things_picture(cloud: GaussianCloud, place: Place, chosen: Sequence[int], device: torch.device) -> Array:
     """The things of a place, each with its number, on what is around it in grey.
-
-    Args:
-        cloud: The splat.
-        place: Its parts.
-        chosen: Numbers of those that will move; they have a frame.
-        device: Where to draw.
 
     Returns:
         8-bit RGB, shape (H, W, 3), up to four in a row.

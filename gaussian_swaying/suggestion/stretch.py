@@ -80,9 +80,6 @@ def linear_motion(bound: Modes, force: WindForce, wind: WindField, top: torch.Te
     The air's damping is that in the mean wind, twice as strong along it as across.
 
     Args:
-        bound: The modes of the body, of one scene.
-        force: The force of the wind on it.
-        wind: The turbulent wind.
         top: Share of each site in the top, shape (S,).
         rate: Samples in a second.
     """
@@ -113,7 +110,6 @@ def cloth_motion(wind: WindField, places: torch.Tensor, frequency: float, ratio:
     """Motion of one oscillator along each axis in the mean wind of some places, as that of a hanging cloth.
 
     Args:
-        wind: The turbulent wind.
         places: Places [m], shape (K, 3).
         frequency: Frequency [Hz].
         ratio: Damping ratio, with that of the air.

@@ -296,7 +296,6 @@ def why_apart(scene: SimulatedScene, dx: float, held: Tensor) -> str | None:
     what does not would fall, though a grid may hold it.
 
     Args:
-        scene: A scene of ``scene.connected: surface``.
         dx: Grid spacing [m].
         held: Which Gaussians are held, bool, shape (N,).
     """

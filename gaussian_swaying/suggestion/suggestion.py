@@ -44,9 +44,7 @@ class Suggestion:
     """Everything that a first simulation of a splat needs.
 
     Attributes:
-        cloud: The splat.
         path: Its file, if there is one.
-        up: The up direction.
         ground: Which of the Gaussians ``near`` are a floor, bool.
         moving: Which of them are simulated.
         hold: The end at which it is held.
@@ -62,7 +60,6 @@ class Suggestion:
         flow: Wind across the picture, or along a sheet from its held side [m/s], z up.
         look: The name of the wind, one of :data:`~gaussian_swaying.wind.turbulence.LOOKS`.
         kind: What it is, one of :data:`~gaussian_swaying.suggestion.kinds.KINDS`.
-        kind_reason: Why, in words.
         material: The known material of its surface, of the kind or as it was given.
         youngs_modulus: Young's modulus [Pa].
         density: Density of the surface [kg/m³].
@@ -190,7 +187,6 @@ class Suggestion:
 
         Args:
             file: The configuration; Gaussians without a file of their own are written beside it.
-            frames: Number of frames.
             splat: The file of the Gaussians that it names; ``path`` if None.
 
         Returns:
@@ -387,10 +383,7 @@ def configuration(s: Suggestion, splat: Path, parts: Path, frames: int) -> str:
     """The configuration as text.
 
     Args:
-        s: The suggestion.
-        splat: The file of its Gaussians.
         parts: That of its parts, if it has some.
-        frames: Number of frames.
 
     Returns:
         YAML for ``--config`` of a simulation.

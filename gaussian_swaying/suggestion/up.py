@@ -35,7 +35,6 @@ def wind_words(flow: Sequence[float], up: Sequence[float]) -> str:
 
     Args:
         flow: Velocity [m/s], z up.
-        up: Direction that points up in the scene.
 
     Example:
         >>> wind_words([2.0, 5.0, 0.0], [0.0, -1.0, 0.0])

@@ -46,12 +46,7 @@ def write_shards(
     The same runs give the same bytes.
 
     Args:
-        folder: Folder of the sweep.
-        runs_per_shard: Runs in a file.
         output: Folder of the files; ``shards`` in the folder of the sweep if None.
-        frames: Whether to put in the pictures.
-        positions: Whether to put in the trajectories.
-        nodes: Whether to put in the displacements of nodes.
 
     Returns:
         The files.
@@ -134,7 +129,6 @@ def write_contact_sheets(folder: Path, picture: str = "last") -> list[Path]:
     """Write ``contact_sheet.png`` of a sweep, and ``contact_sheet_2.png`` ... if there are more than 200 runs.
 
     Args:
-        folder: Folder of the sweep.
         picture: Frame to show, ``last`` or ``middle``.
 
     Returns:

@@ -48,7 +48,6 @@ def read_axis(name: str, given: Any) -> Axis:
     """An axis from its entry in a sweep file.
 
     Args:
-        name: The option.
         given: A list of values; a range ``{from, to, count, scale}``, ends included, with ``scale: log`` for equal
             ratios; or a draw ``{draw, low, high}``, where ``draw`` is ``uniform``, ``log`` (the logarithm is uniform)
             or ``integer`` (both ends included), or ``{draw: choice, of: [...]}``.
@@ -74,11 +73,6 @@ def runs_of(axes: list[Axis], draws: int = 1, seed: int = 0) -> list[dict[str, A
     """The settings of every run: all combinations of lists and ranges, the first axis slowest, each drawn some times.
 
     A drawn value is a function of seed, axis and number of the run, so that it stays when other axes change.
-
-    Args:
-        axes: The axes.
-        draws: Runs of each combination.
-        seed: Seed of the draws.
 
     Returns:
         For each run the value of every axis, in the order of the axes.
@@ -214,7 +208,6 @@ def read_sweep(path: str | os.PathLike[str], find: Callable[[str], str] = str) -
     Args:
         path: YAML with ``base``, ``axes`` and, if needed, ``settings``, ``draws`` and ``seed``; docs/many.md describes
             them.
-        find: Gives the file of a name in ``base``.
     """
     file = Path(path)
     given = read_fields(file, "the sweep file", FIELDS)
@@ -247,7 +240,6 @@ def make_plan(sweep: Sweep, parser: ArgumentParser | None = None) -> Plan:
     that is damaged) is reported by that run.
 
     Args:
-        sweep: The sweep.
         parser: From :meth:`Simulation.parser`; made here if None.
     """
     parser = parser or Simulation.parser()
@@ -271,10 +263,7 @@ def parse_run(parser: ArgumentParser, config: str, frames: int, run: Mapping[str
     """The settings of one run.
 
     Args:
-        parser: From :meth:`Simulation.parser`.
         config: Configuration that all runs share, as YAML.
-        frames: Frames, unless ``run`` has others.
-        run: The value of every axis.
     """
     # parameters that are no options
     own = {n: v for n, v in run.items() if n in POLAR or n.startswith(("forces.", "wind.modulations."))}

@@ -48,12 +48,6 @@ SUMMARY = (*FIGURES, *(f"{name}_end_J" for name in ENERGIES), "warnings")
 def open_folder(folder: Path, plan: Plan, resume: bool, together: int = 1) -> FolderLock:
     """Make and lock the folder of a sweep, or lock the one that is continued.
 
-    Args:
-        folder: The folder.
-        plan: The sweep.
-        resume: Whether to continue the sweep in it.
-        together: Largest number of runs that are simulated together, on which the results depend.
-
     Returns:
         The lock, to be released at the end.
     """
@@ -148,13 +142,7 @@ def read_result(folder: Path, name: str) -> dict[str, Any] | None:
 
 
 def result_of(summary: Mapping[str, Any], attempt: int, where: str) -> dict[str, Any]:
-    """The result of a complete run.
-
-    Args:
-        summary: Its summary, as in ``summary.json``.
-        attempt: Number of times that it was begun in this sweep.
-        where: The machine that did it.
-    """
+    """The result of a complete run."""
     figures = {name: summary.get(name) for name in FIGURES}
     end = summary.get("energy_end_J") or {}
     figures |= {f"{name}_end_J": end.get(name) for name in ENERGIES}
@@ -172,9 +160,6 @@ def write_tables(folder: Path, plan: Plan, results: Mapping[str, Any], parquet: 
     """Write ``sweep.csv``, a row per run in their order; and ``sweep.parquet`` with numbers and lists as such.
 
     Args:
-        folder: Folder of the sweep.
-        plan: The sweep.
-        results: Result of each run that has one, by name.
         parquet: Whether to write the second.
     """
     rows = []

@@ -122,10 +122,7 @@ def work(job: Job, threads: int, explain: Explain, where: str = platform.node())
     """Do a job in a worker and write the results of its complete runs; those of failures are not written yet.
 
     Args:
-        job: The job.
-        threads: Threads of torch.
         explain: Makes a sentence of an error; a function of a module.
-        where: The place of the worker.
     """
     torch.set_num_threads(threads)
     told = io.StringIO()
@@ -207,10 +204,6 @@ def grouped(runs: Sequence[Mapping[str, Any]], size: int) -> list[list[int]]:
     """Numbers of the runs that are simulated together, at most ``size`` of them.
 
     It depends on nothing but the runs and the size, so that a sweep that is resumed has the same groups.
-
-    Args:
-        runs: The value of every axis in each run.
-        size: Largest number of runs in a group.
 
     Example:
         >>> grouped([{"wind.seed": 1, "solver.dx": x} for x in (1, 2, 1, 1)], 2)
@@ -455,8 +448,6 @@ def drive(jobs: Sequence[Job], pool: Pool, ended: Callable[[str, dict[str, Any]]
     callback), the runs are ended in order.
 
     Args:
-        jobs: The jobs.
-        pool: Does them.
         ended: Called with the name and the result of each run, in the order in which they end.
         retries: Number of times that a failed job is tried again; three times as often if its process was killed.
     """
@@ -513,9 +504,6 @@ def run_sweep(
     """Do all runs of a sweep that are not complete yet.
 
     Args:
-        plan: The sweep.
-        output: Its folder.
-        resume: Continue the sweep in it.
         workers: Runs at a time; None for ``per_gpu`` on each GPU, or one on each core.
         threads: Threads of each; None for its share of the cores.
         retries: Number of times that a failed run is tried again; three times as often if its process was killed.
@@ -523,11 +511,8 @@ def run_sweep(
         picture: Frame of the contact sheet, ``last`` or ``middle``.
         explain: Makes a sentence of an error of a run; a function of a module.
         progress: Show a bar of runs, and a line for each failure.
-        started: Called when the folder is locked and the first run is about to begin.
         together: Largest number of runs of equal shape that are simulated together, as one job.
-        per_gpu: Jobs per GPU.
         ray: Address of a Ray cluster, or ``local`` to start Ray here; None for processes of this machine.
-        parquet: Also write ``sweep.parquet``.
 
     Returns:
         The result of every run by name, as in ``results/``.

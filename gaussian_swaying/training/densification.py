@@ -60,11 +60,8 @@ class Densification(ABC):
         """Use a model and its optimiser from now on.
 
         Args:
-            model: The model; its parameters are replaced when the number of Gaussians changes.
             optimizer: Its optimiser, with a group for each of :data:`PARAMETERS`, in this order.
             scene_scale: Extent of the scene [scene units]; size thresholds are shares of it.
-            devices: Number of devices that train together. A step takes so many images; the numbers of steps that the
-                densification was given count images.
         """
         check_positive("scene_scale", scene_scale)
         groups = optimizer.param_groups

@@ -25,7 +25,6 @@ def gaussians_from_points(
         colors: RGB colours from 0 to 1, shape (N, 3).
         sh_degree: Degree of the spherical harmonics, 0 to 3; all but the constant start at zero.
         opacity: Opacity of all, between 0 and 1.
-        scale: Standard deviation as a multiple of the root mean square distance to the three nearest points.
 
     Returns:
         The Gaussians on the CPU in float32.
@@ -55,7 +54,6 @@ def gaussians_from_file(path: str | os.PathLike[str], sh_degree: int) -> Gaussia
     """The Gaussians of a splat, with harmonics of this degree: higher ones are left out, missing ones are zero.
 
     Args:
-        path: A file that :func:`~gaussian_swaying.gaussians.formats.read_gaussians` reads.
         sh_degree: The degree, 0 to 3.
     """
     cloud = read_gaussians(path)

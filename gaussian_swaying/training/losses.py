@@ -44,7 +44,6 @@ def anisotropy_loss(log_scales: Tensor, a: float = 1.1, ratio: str = "paper", re
 
     Args:
         log_scales: Logarithm of the standard deviations [scene units], shape (N, 3).
-        a: Ratio from which on a Gaussian counts as elongated.
         ratio: ``paper`` divides the largest by the second largest scale, so that discs are free; ``max_min`` (Xie et
             al. 2024, "PhysGaussian") divides the largest by the smallest, which asks for balls.
         reduction: ``mean`` or ``sum`` over the Gaussians.
@@ -157,7 +156,6 @@ class LossTerm(nn.Module, ABC):
         stop: Images trained on before it ends; None for the end of the training.
         fade: Images before ``stop`` over which its weight falls to zero in a straight line.
         every: It is computed for one image in so many, with so many times its weight.
-        needs: Some of :data:`NEEDS`.
     """
 
     start: int = 0

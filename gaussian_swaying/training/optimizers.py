@@ -36,9 +36,6 @@ class GaussianAdam(torch.optim.Adam):
         From the second step on, torch's fused kernel is called as ``Adam.step`` would; all else that it does takes the
         host longer than the kernel takes the GPU.
 
-        Args:
-            closure: Called first, as Lightning wants it.
-
         Returns:
             The result of ``closure``.
         """
@@ -103,12 +100,8 @@ def means_rate(rates: LearningRates, scene_scale: float, step: int, max_steps: i
     """Learning rate of the centres at a step: decays exponentially from ``rates.means`` times the scene's extent.
 
     Args:
-        rates: The rates.
         scene_scale: Extent of the scene [scene units].
         step: Number of steps before.
-        max_steps: Number of steps in all.
-        devices: Number of devices that train together, see
-            :func:`~gaussian_swaying.training.parallel.scaled_adam`.
 
     Returns:
         The rate [scene units].

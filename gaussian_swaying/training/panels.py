@@ -27,9 +27,6 @@ def panel(
     Areas are pi s1 s2 on a logarithmic scale from the 5th to the 95th percentile.
 
     Args:
-        model: The Gaussians.
-        renderer: The renderer.
-        camera: The camera.
         photo: Photo, shape (H, W, 3).
         image: Render, shape (H, W, 3); rendered over black if None.
 

@@ -18,10 +18,6 @@ from torch import Tensor, distributed, nn
 def share_gradients(parameters: Sequence[nn.Parameter], loss: Tensor) -> Tensor:
     """Average the gradients over all devices; a parameter without a gradient counts as zero.
 
-    Args:
-        parameters: The parameters; their gradients are replaced.
-        loss: The loss of this device, a scalar.
-
     Returns:
         The mean loss, so that all devices stop if one of them diverges.
     """

@@ -54,8 +54,6 @@ def depth_normal_loss(maps: SurfaceMaps, camera: Camera, weight: Tensor | None =
     Huang et al. 2024 ("2D Gaussian Splatting"), equation 14, with the blended normal divided by its length.
 
     Args:
-        maps: The surface.
-        camera: Its camera, on the same device.
         weight: Weight of each pixel, shape (H, W, 1); equal weights when None.
 
     Returns:
@@ -102,8 +100,6 @@ def round_trip(pixel: Tensor, depth: Tensor, camera: Camera, other: OtherView) -
     Args:
         pixel: Pixel coordinates, shape (S, 2).
         depth: Rendered depth there [scene units], shape (S, 1).
-        camera: The camera.
-        other: The other view with its surface.
 
     Returns:
         Distances [pixels], shape (S,), and where they are defined, bool (S,): where both views show a surface.
@@ -139,8 +135,6 @@ def warped_patches(
         pixel: Centres of the patches [pixels], shape (S, 2).
         normal: Unit normals of their planes in the frame of the camera, shape (S, 3).
         distance: n.x on the planes [scene units], shape (S, 1).
-        camera: The camera.
-        other: The other view.
         radius: Half side of a patch [pixels].
 
     Returns:
@@ -169,7 +163,6 @@ def cross_correlation(one: Tensor, two: Tensor, contrast: float = 0.01) -> tuple
     Args:
         one: Values, shape (S, P).
         two: Values, shape (S, P).
-        contrast: Least standard deviation within a patch; there is nothing to compare in one with less.
 
     Returns:
         Correlations from -1 to 1, shape (S,), and where both patches have enough contrast, bool (S,).

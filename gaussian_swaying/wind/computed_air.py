@@ -156,7 +156,6 @@ class AirPush(Force):
         Args:
             way: How far the points moved [m], shape (P, 3).
             faster: By how much their velocity changed [m/s], shape (P, 3).
-            substeps: How many there were.
             dt: The substep [s].
         """
         way = way - dt * faster
@@ -217,8 +216,6 @@ def resolution(settings: ComputedAir, wind: WindField, frame_dt: float, position
     """Cost of a box, and the Reynolds number that it resolves.
 
     Args:
-        settings: The box.
-        wind: The wind.
         frame_dt: Length of a frame [s].
         position: Points of the body at rest [m], shape (P, 3).
     """
@@ -242,7 +239,6 @@ class AirInBox:
         still: Distance from what stands still in the scene; air within half a cell of it is wall. None for none.
 
     Attributes:
-        flow: The flow.
         steps: Its steps in a frame.
         resolution: What it costs and resolves.
 
@@ -389,15 +385,6 @@ class AirInBox:
         watch: Callable[[int], None] | None = None,
     ) -> tuple[Any, Tensor, Tensor]:
         """Advance the air and the body by a frame: in each step of the air the body moves, and then the air.
-
-        Args:
-            solver: The solver.
-            state: The state of the body now.
-            moments: Those of the air now; they stay as they are.
-            substeps: Substeps of the body that a frame needs; it takes as many in each step of the air.
-            forces: Other forces than that of the air.
-            looks: How often the Courant number is checked.
-            watch: Called with the number of substeps that are done.
 
         Returns:
             The state of the body, the moments of the air, and the largest Courant number.

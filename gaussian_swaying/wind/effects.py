@@ -94,7 +94,6 @@ class WindEffect(Component, nn.Module):
         Args:
             velocity: Air velocity so far [m/s], broadcastable to (..., P, 3).
             position: Places [m], z up, shape (..., P, 3).
-            moment: The time, and the undisturbed flow.
 
         Returns:
             Velocity [m/s], broadcastable to (..., P, 3).

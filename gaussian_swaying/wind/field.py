@@ -149,7 +149,6 @@ class Modulation(Component, nn.Module, ABC):
             velocity: Air velocity [m/s], shape (..., 3), float64.
             time: Time [s], shape (...), float64.
             seed: Seed of the run; of several scenes, one for each, shape (B,).
-            stream: Position of this modulation in the list of its WindField.
         """
         numbers = tuple(getattr(self, name) for name in self.numbers)
         given = velocity.unbind(-1), time, numbers, stream_start(seed, stream, velocity.device)

@@ -263,7 +263,6 @@ def force_adjoint(groups: bool, law: int) -> Any:
 
     Args:
         groups: Whether it is that of :func:`force_on_group`, or else of :func:`force_on_patch`.
-        law: Place in :data:`LAWS`.
     """
     function = force_on_group if groups else force_on_patch
 
@@ -535,8 +534,6 @@ def with_added_mass(points: MaterialPoints, patches: Patches, aero: AeroForce) -
     """The material with the air that it carries; the same object if it carries none.
 
     Args:
-        points: The material of one scene.
-        patches: Its patches.
         aero: The force of the wind, for ``added_mass`` and ``air_density``.
     """
     if aero.carried == 0:

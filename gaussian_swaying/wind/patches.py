@@ -94,7 +94,6 @@ class PatchSums(nn.Module):
 
         Args:
             group: The group of each point, shape (P,).
-            count: Number of groups.
             coarse: As in the constructor.
         """
         length = self.vector.norm(dim=-1)

@@ -176,7 +176,6 @@ def box_axes(flow: Tensor, sides: Sequence[float], tilted: bool) -> Tensor:
     Args:
         flow: The flow [m/s], shape (3,); x if it is zero.
         sides: Lengths of the box along its axes [m].
-        tilted: Whether to turn it.
 
     Returns:
         Orthonormal, shape (3, 3), float64.
@@ -392,8 +391,6 @@ def deposited(place: Tensor, amount: Tensor, cells: int) -> Tensor:
 
     Args:
         place: Places in cells from the first corner, shape (P, 3); within the grid.
-        amount: Shape (P,).
-        cells: Corners along each axis.
 
     Returns:
         Shape (cells, cells, cells).

@@ -56,7 +56,6 @@ def energy_spectrum(k: Tensor, length: float, spectrum: str = "von_karman") -> T
     Args:
         k: Wave number [rad/m], not negative, any shape.
         length: Integral length scale [m].
-        spectrum: As in :func:`along_spectrum`.
 
     Returns:
         E [m], as ``k``.
@@ -79,7 +78,6 @@ def resolved_share(length: float, spacing: tuple[float, float, float], spectrum:
     Args:
         length: Integral length scale [m].
         spacing: Sides of a cell [m].
-        spectrum: As in :func:`along_spectrum`.
 
     Returns:
         A number between 0 and 1.
@@ -155,13 +153,10 @@ def turbulence_box(
     to 3.17). The component along the wind, x, then grows, and the vertical one, z, shrinks, as near the ground.
 
     Args:
-        cells: Cells along x (the wind), y and z.
         spacing: Sides of a cell [m].
         length: Integral length scale of the component along the wind [m]; with a ``gamma``, without the shear.
         spectrum: ``von_karman`` or ``kaimal``.
         gamma: Mann's shear; 0 for isotropic turbulence. Only with ``von_karman``.
-        seed: Of the noise, which is drawn on the CPU, so that it is the same on every device.
-        device: Device on which the transform is computed.
 
     Returns:
         Velocity per standard deviation, shape (*cells, 3), float32.
@@ -377,10 +372,8 @@ def look(
 
     Args:
         name: ``breeze``, ``gusts`` or ``storm``.
-        direction: Where the wind blows to, z up, of any length.
         height: Height of the middle of the object above the ground [m].
         speed: Another mean speed [m/s], with the intensity of the look.
-        seed: Another seed is another turbulence.
 
     Example:
         >>> look("breeze").flows

@@ -115,7 +115,7 @@ def test_leaves_that_shade_each_other_keep_most_of_their_area(leaves, least):
 
 
 def test_a_crown_keeps_its_outer_leaves_and_loses_some_inside():
-    """A known limit (docs/validation.md): leaves of a bunch look like the layers of a hazy skin."""
+    """A known limit (docs/accuracy.md): leaves of a bunch look like the layers of a hazy skin."""
     body = bodies.of_cloud(ficus(count=300), above=bodies.CROWN)
     found = weights(body)
     assert 0.8 < share(*found) <= 1
@@ -126,7 +126,7 @@ def test_a_crown_keeps_its_outer_leaves_and_loses_some_inside():
 
 
 def test_denser_leaves_lose_area():
-    """The other side of the border, a known limit (docs/validation.md)."""
+    """The other side of the border, a known limit (docs/accuracy.md)."""
     body = bodies.leaf_ball(4, across=6)
     weight, areas = weights(body)
     assert 0.85 < (weight * areas).sum() / body.area < 0.95

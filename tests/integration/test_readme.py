@@ -12,10 +12,10 @@ RESULTS = ROOT / "docs" / "results"
 
 
 def test_every_file_that_the_readme_names_exists():
-    named = re.findall(r"\]\((?!https?://)([^)]+)\)", README)
+    named = re.findall(r"\]\((?!https?://)([^)#]+)[^)]*\)", README)
     named += re.findall(r"(?<![\w/])((?:docs|configs|tools)/[\w/.]+\.\w+)", README)
     assert len(named) > 15
-    assert len(README.splitlines()) < 150  # it shows; the pages argue
+    assert len(README.splitlines()) <= 100  # it shows; the pages argue
     for name in named:
         assert (ROOT / name).exists(), name
 

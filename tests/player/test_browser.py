@@ -203,7 +203,7 @@ def test_pictures_change_between_states_and_never_show_the_future(page, drawing)
     """The simulation gives few states a second; the time that is shown rises from picture to picture."""
     session, window = page.session, drawing
     session.pace(0.02)
-    until(lambda: session.rates().real_time < 0.05)
+    until(lambda: session.rate() < 0.05)
     window.evaluate("""() => {
         window.seen = [];
         const look = () => {
@@ -291,6 +291,23 @@ def test_the_bar_and_the_panel_steer_the_session(page, drawing):
     session.change({"wind.flow": [2.0, 0.0, 0.0]})
     window.locator("#reset").click()
     until(lambda: session.snapshot.health.time > 0.02 and not session.broken)
+    assert window.problems == []
+
+
+def test_a_window_records_what_it_shows(page, drawing, tmp_path):
+    iio, window = pytest.importorskip("imageio.v3"), drawing
+    window.get_by_role("button", name="Controls").click()
+    window.locator("summary", has_text="Files").click()
+    window.get_by_role("button", name="Record a video").click()
+    reached(page.session, page.session.snapshot.health.time + 0.5)
+    with window.expect_download(timeout=30_000) as download:
+        window.get_by_role("button", name="Stop recording").click()
+    assert download.value.suggested_filename == "wind.webm"
+    download.value.save_as(tmp_path / "wind.webm")
+    frames = iio.imread(tmp_path / "wind.webm").astype(int)
+    assert len(frames) > 1
+    assert np.abs(frames[-1] - frames[0]).max() > 20  # it moves
+    window.get_by_role("button", name="Record a video").wait_for()
     assert window.problems == []
 
 

@@ -6,10 +6,8 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from PIL import Image
-from shared import value_error
 
-from gaussian_swaying.player.pictures import FLIP, Eye, FilmStrip, PictureSize, draw, enlarged, under_cursor
+from gaussian_swaying.player.pictures import FLIP, Eye, PictureSize, draw, under_cursor
 from gaussian_swaying.rendering.passes import PASSES
 from gaussian_swaying.simulation.draw import View
 
@@ -82,19 +80,6 @@ def test_edges_of_passes_fade(session, shown):
     assert between > 0.5 * outline
 
 
-def test_a_small_picture_is_shown_with_smooth_edges(session):
-    """Closer to the picture at full size than a browser's linear enlargement of the small one."""
-    camera_of, camera = _pose(session)
-    width, height = 4 * (camera.width // 4), 4 * (camera.height // 4)
-    full = draw(session.snapshot, camera_of(width, height)).astype(float)
-    small = draw(session.snapshot, camera_of(width // 4, height // 4))
-    ours = enlarged(small, width, height)
-    assert ours.shape == full.shape
-    linear = np.asarray(Image.fromarray(small).resize((width, height), Image.Resampling.BILINEAR)).astype(float)
-    assert np.square(ours - full).mean() < np.square(linear - full).mean()
-    assert enlarged(ours, width, height) is ours
-
-
 def test_the_cursor_finds_what_is_under_it(session):
     place = under_cursor(session.snapshot, [0.6, -3.0, 0.4], [0.0, 1.0, 0.0])
     assert place == pytest.approx([0.6, 0.0, 0.4], abs=0.04)
@@ -116,36 +101,3 @@ def test_pictures_get_smaller_where_they_take_long():
     for _ in range(10):
         size.took(0.01)
     assert size.fit(400, 300) == (400, 300)
-
-
-def test_a_film_is_as_long_as_the_simulated_time():
-    """At 0.01 s a picture, and with a gap, and after going back to rest."""
-    iio = pytest.importorskip("imageio.v3")
-    film = FilmStrip()
-    times = [1.0 + 0.01 * k for k in range(50)] + [2.0] + [0.0, 0.2]
-    for k, time in enumerate(times):
-        film.add(time, np.full((32, 48, 3), 4 * k, dtype=np.uint8))
-    film.add(0.24, np.full((16, 24, 3), 255, dtype=np.uint8))  # another size gets that of the first
-    assert film.seconds == pytest.approx(1.24, abs=0.09)
-    content = film.finish()
-    frames = iio.imread(content, extension=".mp4")
-    assert len(frames) == round(film.seconds * 25)
-    assert frames[0].mean() < frames[10].mean() < frames[-1].mean()
-
-
-def test_a_film_ends_at_its_greatest_length(monkeypatch):
-    monkeypatch.setattr("gaussian_swaying.player.pictures.LONGEST", 0.2)
-    film = FilmStrip()
-    picture = np.zeros((32, 48, 3), dtype=np.uint8)
-    film.add(0.0, picture)
-    assert not film.full
-    film.add(0.2, picture)
-    assert film.full
-    film.add(5.0, picture)
-    assert film.seconds < 0.3
-    film.finish()
-
-
-def test_a_film_without_pictures_is_refused():
-    with value_error("Nothing was recorded"):
-        FilmStrip().finish()

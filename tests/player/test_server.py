@@ -537,21 +537,3 @@ def test_a_bar_shows_how_far_a_scene_is_loaded(show, connect):
     show(server=server)
     client.wait("figures", loading=None)
     client.wait("state")  # for the client that came early, too
-
-
-def test_a_video_comes_out(page, connect, tmp_path):
-    """It shows simulated time, from the camera of the browser that asked for it."""
-    iio = pytest.importorskip("imageio.v3")
-    client = connect(page)
-    client.say("record")
-    client.wait("figures", lambda head: (head.get("recorded") or 0) > 0.3, seconds=240)
-    client.say("record")
-    assert client.wait("file")["name"] == "wind.mp4"
-    (tmp_path / "wind.mp4").write_bytes(_open(f"{page.url}/save/wind.mp4")[2])
-    frames = iio.imread(tmp_path / "wind.mp4")
-    assert len(frames) > 7
-    assert abs(frames[0].astype(int) - frames[-1].astype(int)).max() > 20  # it moves
-    client.wait("state")  # the browser draws again
-    client.say("record")
-    client.say("record")
-    client.wait("figures", lambda head: "Nothing was recorded" in head["notice"])

@@ -290,8 +290,7 @@ def test_slow_motion_is_slower(session, monkeypatch, speed, step, expected):
     while now[0] < 1.5 * WINDOW:  # the first steps, before which nothing was waited for, are forgotten
         session._advance(single=False)
     assert session.simulation.frame_dt == pytest.approx(0.04)
-    assert session.rates().real_time == pytest.approx(expected)
-    assert session.rates().steps == pytest.approx(expected / 0.04)
+    assert session.rate() == pytest.approx(expected)
 
 
 def test_steps_get_shorter_where_they_take_long(parser, settings, monkeypatch):
@@ -378,7 +377,7 @@ def test_a_step_that_is_under_way_does_not_lower_the_rates(session, monkeypatch)
     now = 100.0
     monkeypatch.setattr("gaussian_swaying.player.session.time", SimpleNamespace(perf_counter=lambda: now))
     session._steps.extend((now - 1.03 + 0.04 * k, 0.04 * k) for k in range(26))  # the last one 0.03 s ago
-    assert session.rates().real_time == pytest.approx(1.0, abs=0.02)
+    assert session.rate() == pytest.approx(1.0, abs=0.02)
     session._steps.clear()
     session._steps.extend((now - 1.5 + 0.04 * k, 0.04 * k) for k in range(26))  # and 0.5 s ago: it is late
-    assert session.rates().real_time == pytest.approx(1.0 / 1.46, abs=0.03)
+    assert session.rate() == pytest.approx(1.0 / 1.46, abs=0.03)

@@ -71,7 +71,7 @@ class Known:
         coarse: Parameters of the runs that the tests make.
         fine: Parameters of those that are recorded.
         loose: Goals of coarse runs that replace those of fine ones.
-        page: The page that shows the fine runs.
+        page: The page that shows the finest run.
     """
 
     name: str
@@ -80,7 +80,7 @@ class Known:
     coarse: Sequence[Row] = ()
     fine: Sequence[Row] = ()
     loose: Goal = field(default_factory=dict)
-    page: str = "validation.md"
+    page: str = ""
 
     def measure(self, device: str = "cpu", **parameters: Any) -> Row:
         """The results of a run."""
@@ -222,10 +222,11 @@ KNOWN = [
         [FREE | {"cells": (16, 32, 64), "periods": 2},
          FREE | {"variant": "updated", "cells": (16, 32), "strain": 0.001, "periods": 2}],
         [FREE | {"variant": name, "cells": (32, 64)} for name in VARIANTS],
+        page="accuracy.md",
     ),
     Known(
         "slender bar with free ends", bars.vibrating_bar, {"error": within(0.005), "order": SECOND},
-        fine=[FREE | {"cells": (16, 64), "periods": 2, "confined": False, "poisson_ratio": 0.0}], page="",
+        fine=[FREE | {"cells": (16, 64), "periods": 2, "confined": False, "poisson_ratio": 0.0}],
     ),
     Known(
         "bar of the updated formulation at a strain of 0.1", bars.vibrating_bar, {"error": within(0.005)},
@@ -258,7 +259,7 @@ KNOWN = [
         [CLAMPED | {"cells": n, "periods": 2} for n in (16, 32)], [CLAMPED | {"cells": 64}],
     ),
     Known(
-        "the same in updated, which holds all that it touches", bars.vibrating_bar, {"end_shift": within(0.5)},
+        "bar held by nodes in `updated`", bars.vibrating_bar, {"end_shift": within(0.5)},
         [CLAMPED | {"variant": "updated", "cells": 32, "periods": 2}], [CLAMPED | {"variant": "updated", "cells": 64}],
         {"end_shift": near(-0.75, 0.05)},
     ),
@@ -273,7 +274,7 @@ KNOWN = [
         fine=[{"variant": name, "cells": (16, 32), "clamp": "mirror"} for name in ("total", "total, float32")],
     ),
     Known(
-        "the same in updated", bars.hanging_bar, {"error": within(lambda r: 0.26 / r["cells"] ** 2)},
+        "hanging bar in `updated`, tip", bars.hanging_bar, {"error": within(lambda r: 0.26 / r["cells"] ** 2)},
         [{"variant": "updated", "cells": 16}], [{"variant": "updated", "cells": 32, "clamp": "mirror"}],
         {"error": within(0.01)},
     ),
@@ -288,9 +289,10 @@ KNOWN = [
         [{"variant": "total", "cells": 4, "shift": 0.3}],
         [{"variant": "total", "cells": 16, "hold": "hinge", "layers": n} for n in (3, 1)],
         {"error": within(0.15), "slope": near(1, 0.05), "moment": within(0.5)},
+        page="accuracy.md",
     ),
     Known(
-        "the same strip on clamps sags by a fifth", strips.hinged_strip,
+        "strip on clamps, whose sag is a fifth", strips.hinged_strip,
         {"error": (0.75, lambda r: 0.8 + 1 / r["cells"] ** 2), "slope": (-ANY, 0.1)},
         [{"variant": "total", "cells": 4, "hold": "clamp"}],
         [{"variant": "total", "cells": 32, "hold": "clamp", "layers": 3}],
@@ -312,6 +314,7 @@ KNOWN = [
         [{"variant": name, "cells": (24, 32)} for name in VARIANTS],
         # a transfer is off by dx² / 8 of the second derivative, 64 times the turn at its crest; there are two
         {"error": within(lambda r: 2 * 64 / 8 / _last(r) ** 2)},
+        page="accuracy.md",
     ),
     Known(
         "cantilever under its weight: drop that neither shear nor quadrature explains", beams.cantilever,
@@ -321,6 +324,7 @@ KNOWN = [
         + [{"variant": "total", "cells": 2, "b": b} for b in (4.0, 8.0)],
         {"quadrature": (lambda r: 0.95 / (4 * r["cells"] ** 2 - 1), lambda r: 1.05 / (4 * r["cells"] ** 2 - 1)),
          "error": within(lambda r: r["shear"] + r["quadrature"] + 0.005)},
+        page="accuracy.md",
     ),
     Known(
         "cantilever of one cell: two layers of points bend without strain", beams.cantilever, {"error": (1.0, ANY)},
@@ -344,6 +348,7 @@ KNOWN = [
         [{"variant": "total", "diameter": d, "around": 8, "worst": {"place": SPOTS, "axis": AXES}}
          for d in (0.05, 0.1, 0.3, 1.0)],
         {"error": within(0.06), "lowest": (0.0, of("highest"))},
+        page="accuracy.md",
     ),
     Known(
         "comb of beams 0.3 cells apart, each a piece, frequencies", _comb, {"error": within(0.03)},
@@ -351,13 +356,13 @@ KNOWN = [
         [{"variant": "total", "thickness": t, "gap": 0.3, "how": "apart"} for t in (0.3, 1.0)],
     ),
     Known(
-        "the same whose held ends are one piece", _comb, {"error": within(0.03)},
+        "comb of beams whose held ends are one piece, frequencies", _comb, {"error": within(0.03)},
         [{"variant": "total", "thickness": 1.0, "gap": 0.3, "how": "base", "count": 3, "shortest": 6.0}],
         [{"variant": "total", "thickness": t, "gap": 0.3, "how": "base"} for t in (0.3, 1.0)],
         {"error": (0.02, 0.3)},
     ),
     Known(
-        "the same on shared nodes, which make one plate of it", _comb, {"error": (1.0, ANY)},
+        "comb of beams on shared nodes, which make one plate of it", _comb, {"error": (1.0, ANY)},
         [{"variant": "total", "thickness": 1.0, "gap": 0.3, "how": "shared", "count": 3, "shortest": 6.0}],
     ),
     Known(
@@ -374,14 +379,16 @@ KNOWN = [
         "two beams and a joint with stiffness, frequency", joints.joined_beams, {"error": within(0.02)},
         [{"variant": "total", "turning": k, "length": 14.0} for k in (1.0, math.inf)],
         [{"variant": "total", "turning": k} for k in (0.1, 1.0, 10.0, 1000.0)], {"error": within(0.04)},
+        page="accuracy.md",
     ),
     Known(
         "free block: energy after many periods, and momenta", bars.free_block,
         {"error": within(1e-3), "growth": (-ANY, of("swing")), "linear": within(1e-12), "angular": within(1e-12)},
         [{"variant": "total", "periods": 30, "cells": 3}], [{"variant": "total", "periods": 100}],
+        page="accuracy.md",
     ),
     Known(
-        "the same in updated, whose transfers smooth what vibrates", bars.free_block,
+        "free block in `updated`", bars.free_block,
         {"error": within(1e-3), "linear": within(1e-12), "angular": within(1e-12)},
         fine=[{"variant": "updated", "periods": 20}],
     ),
@@ -393,6 +400,7 @@ KNOWN = [
          for k, law in ((0.5, "paper"), (0.5, "projected"), (2.0, "projected"))]
         + [{"variant": "updated", "k": 0.5, "law": "paper"}],
         {"error": within(0.2)},
+        page="accuracy.md",
     ),
     Known(
         "plate that bends in a flow, drag", reconfiguration.reconfiguration, {"error": within(0.01)},
@@ -404,6 +412,7 @@ KNOWN = [
            for law in reconfiguration.POWERS],
         {"error": within(0.05), "drift": within(5e-3), "drag": (0, 0.9),
          "tip": (of("exact_tip", more=-0.05), of("exact_tip", more=0.05))},
+        page="accuracy.md",
     ),
     Known(
         "inverted flag, pressure at which it diverges", divergence.divergence,
@@ -411,6 +420,7 @@ KNOWN = [
         [{"variant": "total", "cells": 8, "slenderness": 30.0}],
         [{"variant": "total", "cells": 32, "slenderness": 60.0}],
         {"error": within(0.08)},
+        page="accuracy.md",
     ),
     Known(
         "strip of a fabric that hangs over an edge, drop", fabrics.hanging_strip, {"error": within(0.03)},
@@ -425,6 +435,7 @@ KNOWN = [
         [{"shape": "sphere", "law": "paper", "count": 500, "overlap": 0.5, "area": "coverage"}],
         [{"shape": shape, "law": "paper", "count": n, "overlap": o, "area": "coverage"}
          for shape in ("plate", "sphere") for n, o in ((500, 0.5), (2000, 0.3), (2000, 1.0))],
+        page="accuracy.md",
     ),
     Known(
         "angles of friction of the law for sand [degrees]", _angles,
@@ -455,6 +466,7 @@ KNOWN = [
         {"runout": (lambda r: lube(r["aspect"]) / 1.6, lambda r: 1.6 * lube(r["aspect"])), "lost": near(0, 0),
          "volume_ratio": near(1, 0.03)},
         fine=[{"variant": "updated", "aspect": a, "cells": 16} for a in (0.5, 1.0, 2.0, 3.0)],
+        page="accuracy.md",
     ),
     Known(
         "taller and weaker columns of sand spread further", _spread,
@@ -474,13 +486,14 @@ KNOWN = [
         "tree, frequency beside that of a frame of beams", trees.frequency, {"error": within(0.05)},
         [{"leaf_area": 30.0, "dx": 0.5, "height": 6.0, "branches": 2}],
         [{"leaf_area": a, "dx": dx} for a in (0.0, 180.0) for dx in (1.0, 0.5, 0.25)],
-        {"error": within(0.15), "leaves": near(6.0, 0.3)}, "nature.md",
+        {"error": within(0.15), "leaves": near(6.0, 0.3)},
+        page="accuracy.md",
     ),
     Known(
         "tree, damping ratio beside that of its mode", trees.damping, {"error": within(0.05)},
         [{"leaf_area": 30.0, "pull": 0.2, "dx": 1.0, "periods": 1.0, "height": 6.0, "branches": 1}],
         [{"leaf_area": a, "pull": 1.2, "breeze": 0.0, "dx": dx} for dx in (0.5, 0.25) for a in (0.0, 180.0)],
-        {"error": within(0.3), "exact": (0.051, ANY)}, "nature.md",
+        {"error": within(0.3), "exact": (0.051, ANY)},
     ),
     Known(
         "crown, drag at 25 m/s beside elasticas', and how it grows", crowns.crown,
@@ -488,7 +501,8 @@ KNOWN = [
         [{"species": "birch", "speeds": (10.0, 20.0), "cells": 5, "branches": 2, "settle": 6.0}],
         [{"species": species, "cells": n} for species in crowns.CROWNS for n in (8, 16)],
         {"error": within(0.12), "R_10": (of("R_20"), 0.7),
-         "exponent": (of("elastica", more=-0.15), of("elastica", more=0.15))}, "nature.md",
+         "exponent": (of("elastica", more=-0.15), of("elastica", more=0.15))},
+        page="accuracy.md",
     ),
     Known(
         "plate that falls, speed at any time", falling.fall,
@@ -497,12 +511,13 @@ KNOWN = [
          for law, tilt in (("projected", 0.0), ("projected", 40.0), ("cross_flow", 40.0))],
         [{"law": law, "tilt": tilt} for law in ("projected", "cross_flow") for tilt in (0.0, 30.0, 60.0)],
         {"turned": within(1e-6),
-         "along": (lambda r: _slid(r) - 1e-6, lambda r: _slid(r) + 1e-6)}, "nature.md",
+         "along": (lambda r: _slid(r) - 1e-6, lambda r: _slid(r) + 1e-6)},
+        page="accuracy.md",
     ),
     Known(
         "plate that falls and turns, decay of its spin", falling.fall, {"error": within(0.02)},
         [{"spin": 0.2, "cells": 8, "settle": 1.5}], [{"law": "cross_flow", "spin": 0.2, "cells": 32}],
-        {"error": (-0.09, 0)}, "nature.md",
+        {"error": (-0.09, 0)},
     ),
     Known(
         "fabric over a disc, drape coefficient beside a shell's", drapes.drape,
@@ -510,13 +525,15 @@ KNOWN = [
         [{"fabric": "denim", "folds": f, "cells": 4, "settle": 5.0, "layers": n} for n, f in ((3, 4), (1, 5))],
         [{"fabric": fabric, "folds": 5, "cells": n} | layers
          for fabric in drapes.SHELL for n in (6, 8) for layers in ({}, {"layers": 1})],
-        {"error": within(0.2)}, "nature.md",
+        {"error": within(0.2)},
+        page="accuracy.md",
     ),
     Known(
         "wrinkles of a stretched sheet, wavelength beside a shell's", wrinkles.wrinkles,
         {"error": within(0.1), "stretched": near(0.05, 0.0025)},
         fine=[{"bending": 2e-7, "cells": n} for n in (32, 48, 64, 80)]
-        + [{"bending": 2e-7, "cells": n, "layers": 1} for n in (32, 48)], page="nature.md",
+        + [{"bending": 2e-7, "cells": n, "layers": 1} for n in (32, 48)],
+        page="accuracy.md",
     ),
     Known(
         "a sheet on few cells is too stiff to wrinkle", wrinkles.wrinkles,

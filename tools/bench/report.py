@@ -23,16 +23,7 @@ def table(
     where: Callable[[SimpleNamespace], bool] = lambda run: True,
     order: Callable[[SimpleNamespace], object] | None = None,
 ) -> None:
-    """Declare a table with one row for each run.
-
-    Args:
-        name: Name of the section.
-        records: The study whose runs it shows.
-        head: Names of the columns, separated by `` | ``.
-        row: Makes the cells of a run, separated in the same way.
-        where: The runs that have a row; those that failed have none.
-        order: What the rows are sorted by; otherwise they stand as they were recorded.
-    """
+    """Declare a table with one row for each run."""
 
     def make() -> str:
         runs = [run for run in read(records) if not hasattr(run, "failed") and where(run)]

@@ -36,7 +36,6 @@ class FitVideo:
         read_noise: Standard deviation of the noise of a black pixel, as a share of white.
         shot_noise: Variance of the noise of a white pixel that comes from counting photons.
         quality: Of the JPEG files, 1 to 95.
-        seed: Of the noise.
         light: Direction towards the light, z up.
         ambient: Share of ambient light.
         background: Its colour, 0 to 1.

@@ -65,8 +65,6 @@ class Cloth:
         positions: Vertices at each frame [m], float32, shape (F, V, 3).
         faces: Squares as indices of vertices, with normals on the camera's side; shape (Q, 4).
         uv: Position of each vertex on the flag, in 0 to 1, (V, 2). Vertex i (rows + 1) + j is the j-th of column i.
-        columns: Faces along u.
-        rows: Faces along v.
         settings: Fields of the :class:`FlagPattern` that determine the motion.
     """
 

@@ -72,7 +72,6 @@ class Filmed:
         normal: Direction from which the first two cameras look, see :func:`fit_video.ring_views`.
         fps: Frames per second.
         hash: Of the settings of the motion.
-        studio: Makes the studio.
     """
 
     positions: np.ndarray

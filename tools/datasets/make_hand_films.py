@@ -92,7 +92,6 @@ class Thing:
     """Something that moves, and what a fit is to know of it.
 
     Attributes:
-        motion: What is drawn.
         cloud: The splat of it at rest.
         region: Box around it, of which the room has nothing: lower and upper corner [m].
         supports: What holds it, as surfaces.
@@ -100,7 +99,6 @@ class Thing:
         spacing: Distance of the Gaussians of the room [m].
         truth: For ``truth.json``.
         scene: For ``scene.yaml``, with what is simulated and how.
-        ranges: Of the unknowns.
     """
 
     motion: Filmed

@@ -1,5 +1,5 @@
 // Writes film.min.js of the package, the programs of films and of both live pages with what they use of Spark and three.js,
-// sway.min.js for scenes of others, and worker.min.js, the solver in a browser.
+// sway.min.js and sway-playcanvas.min.js for scenes of others, and worker.min.js, the solver in a browser.
 import { build } from "esbuild";
 import { createHash } from "node:crypto";
 import { readFile } from "node:fs/promises";
@@ -48,17 +48,18 @@ await build({
   plugins: [{ name: "cut-spark", setup: (made) => made.onLoad({ filter: /spark\.module\.js$/ }, cutSpark) }],
 });
 
-// sway.js, with three.js and Spark as its user has them.
-await build({
-  entryPoints: ["sway.js"],
-  outfile: "../../gaussian_swaying/player/film/page/sway.min.js",
-  bundle: true,
-  minify: true,
-  format: "esm",
-  external: ["three", "@sparkjsdev/spark"],
-  banner: await banner(["build.js", "bundle.js", "film.glsl.js", "gaussians.js", "sorter.js", "sway.js"]),
-  logLevel: "info",
-});
+// What plays a film in scenes of others, with the engine as its user has it.
+for (const [name, own] of [["sway", ["gaussians.js", "sorter.js"]], ["sway-playcanvas", []]])
+  await build({
+    entryPoints: [`${name}.js`],
+    outfile: `../../gaussian_swaying/player/film/page/${name}.min.js`,
+    bundle: true,
+    minify: true,
+    format: "esm",
+    external: ["three", "@sparkjsdev/spark", "playcanvas"],
+    banner: await banner(["build.js", "bundle.js", "film.glsl.js", ...own, `${name}.js`]),
+    logLevel: "info",
+  });
 
 await build({
   entryPoints: ["live_web/worker.js"],

@@ -24,6 +24,26 @@ export const FUNCTIONS = `
     return axes * transpose(axes);
   }
 
+  // Rotation wxyz and standard deviations of a covariance, by Jacobi's rotations.
+  void filmAxes(mat3 A, out vec4 q, out vec3 s) {
+    q = vec4(1.0, 0.0, 0.0, 0.0);
+    for (int k = 0; k < 15; ++k) {
+      int a = k % 3, b = (k + 1) % 3;
+      if (A[a][b] == 0.0) continue;
+      float skew = 0.5 * (A[b][b] - A[a][a]) / A[a][b];
+      float t = (skew < 0.0 ? -1.0 : 1.0) / (abs(skew) + sqrt(skew * skew + 1.0));
+      float c = inversesqrt(t * t + 1.0);
+      mat3 J = mat3(1.0);
+      J[a][a] = J[b][b] = c;
+      J[a][b] = -(J[b][a] = t * c);
+      A = transpose(J) * A * J;
+      vec4 h = vec4(sqrt(0.5 + 0.5 * c), 0.0, 0.0, 0.0); // the same rotation, by half the angle about the third axis
+      h[1 + (k + 2) % 3] = -0.5 * t * c / h.x;
+      q = vec4(q.x * h.x - dot(q.yzw, h.yzw), q.x * h.yzw + h.x * q.yzw + cross(q.yzw, h.yzw));
+    }
+    s = sqrt(max(vec3(A[0][0], A[1][1], A[2][2]), 0.0));
+  }
+
   // A factor of the captured colour, as in rendering/shading.py: light, then (two-sided, ambient, relative, on).
   float filmLambert(vec3 normal, vec3 light, vec4 kind) {
     float cosine = dot(normal, light);
@@ -102,8 +122,8 @@ const FACING = (i) => `
   vec3 normal = facing.xyz;
 `;
 
-// `grown` is how much larger all Gaussians would have to be to cover as much as when all have come. One that never moves has no light; one that is at rest has.
-export const statements = (kind) => ({ inputs: i, outputs: o }) => `
+// A Gaussian at rest: center, color, opacity and covariance A. `grown` is how much larger all would have to be to cover as much as when all have come.
+export const REST = (i) => `
   ivec2 texel = filmTexel(${i.index});
   uvec4 rest = texelFetch(${i.rest}, texel, 0);
   uvec4 sizes = texelFetch(${i.shape}, texel, 0);
@@ -114,11 +134,7 @@ export const statements = (kind) => ({ inputs: i, outputs: o }) => `
     vec4(unpackSnorm2x16(sizes.x), unpackSnorm2x16(sizes.y)),
     max(1.0, ${i.grown} * float((sizes.w >> 16) & 255u) / 255.0) * exp(vec3(unpackHalf2x16(sizes.z), unpackHalf2x16(sizes.w).x))
   );
-${kind === "still" ? "" : FACING(i)}${kind === "moving" ? MOTION(i) : ""}${kind === "still" ? "" : LIGHT(i)}
-  ${o.covsplat}.center = center;
-  ${o.covsplat}.flags = GSPLAT_FLAG_ACTIVE;
-  ${o.covsplat}.rgba = vec4(color, rgba.a);
-  ${o.covsplat}.index = ${i.index};
-  ${o.covsplat}.xxyyzz = vec3(A[0][0], A[1][1], A[2][2]);
-  ${o.covsplat}.xyxzyz = vec3(A[0][1], A[0][2], A[1][2]);
-`.split("\n");
+`;
+
+// How one that may move changes, with its light; one that never moves has none.
+export const MOVING = (i) => FACING(i) + MOTION(i) + LIGHT(i);

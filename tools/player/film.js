@@ -1,13 +1,11 @@
 // A film of Gaussians: splats once, the displacement of grid nodes per frame. See docs/web.md.
-import { Frames } from "./bundle.js";
-import { reader } from "./gaussians.js";
+import { Frames, readHead } from "./bundle.js";
 import { button, element } from "./panel.js";
 import { View } from "./view.js";
 
 // `read(name)` gives a part of the file once it is there; `tell(sentence)` is called if the file ends too early.
 export async function play(read, tell) {
-  const head = JSON.parse(new TextDecoder().decode(await read("head")));
-  const stencils = reader(await read("stencils"))(Uint32Array, 27 * head.stencils);
+  const [head, stencils] = await readHead(read);
   const frames = new Frames(head);
 
   const state = { frame: -1, time: 0, playing: true, last: null };
@@ -61,16 +59,15 @@ export async function play(read, tell) {
 
   function tick(now) {
     if (!state.playing || view.first === null) return;
-    const end = head.frames * head.frame_dt;
     state.time += state.last === null ? 0 : Math.min(now - state.last, 250) / 1000;
     state.last = now;
     if (frames.loaded < head.frames) state.time = Math.min(state.time, (frames.loaded - 1) * head.frame_dt);
-    if (state.time >= end && !looping()) {
+    if (state.time >= frames.duration && !looping()) {
       seek(head.frames - 1);
       setPlaying(false);
     } else {
-      state.time %= end;
-      show(Math.min(Math.floor(state.time / head.frame_dt + 1e-6), frames.loaded - 1));
+      state.time %= frames.duration;
+      show(frames.at(state.time));
     }
   }
 

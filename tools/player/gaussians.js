@@ -1,66 +1,30 @@
 // Gaussians on a canvas that follow the nodes of a grid, as films and the live page draw them. See docs/web.md.
 import { dyno, SparkRenderer, SplatGenerator } from "@sparkjsdev/spark";
 import * as THREE from "three";
-import { FUNCTIONS, statements } from "./film.glsl.js";
+import { fill, lightOf, limitOf, rowsOf, TEXELS, texels, WIDTH } from "./bundle.js";
+import { FUNCTIONS, MOVING, REST } from "./film.glsl.js";
 import { makeSorter } from "./sorter.js";
 
-const WIDTH = 2048; // of the textures with a texel for each Gaussian or node
-
-// ---- the parts of the file, see gaussian_swaying/player/film/page.py
-
-export function reader(bytes) {
-  let at = 0;
-  return (Kind, count) => {
-    const size = Kind.BYTES_PER_ELEMENT;
-    const out = new Uint8Array(count * size);
-    for (let plane = 0; plane < size; plane++)
-      for (let i = 0; i < count; i++) out[i * size + plane] = bytes[at++];
-    return new Kind(out.buffer);
-  };
-}
-
-// Writes the displacements of all nodes [m], four numbers each: `near` has steps, `far` index and displacement of the few that swing far.
-export function writeNodes(data, near, far, step) {
-  for (let i = 0, at = 0; i < near.length; i += 3, at += 4) {
-    data[at] = step * near[i];
-    data[at + 1] = step * near[i + 1];
-    data[at + 2] = step * near[i + 2];
-  }
-  for (let i = 0; i < far.rows.length; i += 4) data.set(far.values.subarray(i + 1, i + 4), 4 * far.rows[i]);
-}
-
-// Bytes of a Gaussian, in the texels of each of its textures, as RECORD in page.py lists them: position and colour; rotation,
-// size and growth; for those that move also their place in the grid, their stencil, and their normal.
-const TEXELS = { still: { rest: 16, shape: 15 }, moving: { rest: 16, shape: 15, place: 16, facing: 8 } };
-const STEP = 16; // bytes of a texel
-
-// ---- textures
-
-// Whole numbers, four of 32 bits for each Gaussian.
-function texels(count) {
-  const height = Math.max(1, Math.ceil(count / WIDTH));
-  const made = new THREE.DataTexture(new Uint32Array(4 * WIDTH * height), WIDTH, height, THREE.RGBAIntegerFormat, THREE.UnsignedIntType);
-  made.internalFormat = "RGBA32UI";
-  return made;
-}
-
-// Four numbers for each node.
-function floats(count) {
-  const height = Math.max(1, Math.ceil(count / WIDTH));
-  const made = new THREE.DataTexture(new Float32Array(4 * WIDTH * height), WIDTH, height, THREE.RGBAFormat, THREE.FloatType);
-  made.needsUpdate = true;
-  return made;
-}
-
-// The 27 nodes of each stencil, as their rows in the list of nodes, in nine texels: those along z are together.
-function rowsTexture(stencils) {
-  const made = texels(stencils.length / 3);
-  stencils.forEach((row, k) => (made.image.data[4 * Math.floor(k / 3) + (k % 3)] = row));
+// Four numbers for each Gaussian, or node.
+function texture(data) {
+  const whole = data instanceof Uint32Array;
+  const [format, type] = whole ? [THREE.RGBAIntegerFormat, THREE.UnsignedIntType] : [THREE.RGBAFormat, THREE.FloatType];
+  const made = new THREE.DataTexture(data, WIDTH, data.length / (4 * WIDTH), format, type);
+  if (whole) made.internalFormat = "RGBA32UI";
   made.needsUpdate = true;
   return made;
 }
 
 // ---- the Gaussians in the shader graph of Spark
+
+const COVSPLAT = (i, o) => `
+  ${o.covsplat}.center = center;
+  ${o.covsplat}.flags = GSPLAT_FLAG_ACTIVE;
+  ${o.covsplat}.rgba = vec4(color, rgba.a);
+  ${o.covsplat}.index = ${i.index};
+  ${o.covsplat}.xxyyzz = vec3(A[0][0], A[1][1], A[2][2]);
+  ${o.covsplat}.xyxzyz = vec3(A[0][1], A[0][2], A[1][2]);
+`;
 
 // The Gaussians of one kind: all those that move, or all others. They come in parts, the first ones spread over the whole
 // scene. Until all are there, each is larger, so that they cover as much as all of them.
@@ -72,14 +36,14 @@ class Layer {
     this.textures = {};
     this.inputs = { ...shared, grown: new dyno.DynoFloat({ value: 1 }) };
     for (const name in TEXELS[kind]) {
-      this.textures[name] = texels(count);
+      this.textures[name] = texture(texels(count));
       this.inputs[name] = new dyno.DynoUsampler2D({ value: this.textures[name] });
     }
     this.group = new THREE.Group();
     this.draw("still");
   }
 
-  // Draw them as "moving", as "resting", which has a shorter shader, or as "still".
+  // Draw them as "moving", or as "still", which has a shorter shader.
   draw(as) {
     const { grown, rest, shape } = this.inputs;
     const inputs = as === "still" ? { grown, rest, shape } : this.inputs;
@@ -91,7 +55,7 @@ class Layer {
         outTypes: { covsplat: dyno.CovSplat },
         globals: () => [dyno.defineGsplat, dyno.defineCovSplat, FUNCTIONS],
         inputs: { index, ...inputs },
-        statements: statements(as),
+        statements: ({ inputs, outputs }) => `${REST(inputs)}${as === "still" ? "" : MOVING(inputs)}${COVSPLAT(inputs, outputs)}`.split("\n"),
       });
       return { covsplat: step.outputs.covsplat };
     });
@@ -102,16 +66,11 @@ class Layer {
 
   // Add the next Gaussians, see pack_splats in page.py.
   add(bytes) {
-    const sizes = TEXELS[this.kind];
-    const count = bytes.length / Object.values(sizes).reduce((sum, size) => sum + size);
-    let at = 0;
-    for (const name in sizes) {
-      const { image } = this.textures[name];
-      const out = new Uint8Array(image.data.buffer, STEP * this.loaded, STEP * count);
-      for (let k = 0; k < sizes[name]; k++) for (let i = k; i < out.length; i += STEP) out[i] = bytes[at++];
+    const count = fill(this.kind, bytes, this.loaded, (name) => this.textures[name].image.data);
+    for (const made of Object.values(this.textures)) {
       for (let row = Math.floor(this.loaded / WIDTH); row * WIDTH < this.loaded + count; row++)
-        this.textures[name].addUpdateRange(4 * WIDTH * row, 4 * WIDTH);
-      this.textures[name].needsUpdate = true;
+        made.addUpdateRange(4 * WIDTH * row, 4 * WIDTH);
+      made.needsUpdate = true;
     }
     this.loaded += count;
     this.generator.numSplats = this.loaded;
@@ -122,7 +81,7 @@ class Layer {
   // Red, green and blue of Gaussian i, as bytes.
   recolour(i, colour) {
     const { rest } = this.textures;
-    new Uint8Array(rest.image.data.buffer).set(colour, STEP * i + 12);
+    new Uint8Array(rest.image.data.buffer).set(colour, 16 * i + 12);
     rest.addUpdateRange(4 * WIDTH * Math.floor(i / WIDTH), 4 * WIDTH);
     rest.needsUpdate = true;
   }
@@ -136,15 +95,15 @@ class Layer {
 export class Splat {
   constructor(head, stencils) {
     this.count = head.count;
-    this.moved = floats(head.nodes);
-    this.rows = rowsTexture(stencils);
+    this.moved = texture(texels(head.nodes, Float32Array));
+    this.rows = texture(rowsOf(stencils));
     this.inputs = {
       rows: new dyno.DynoUsampler2D({ value: this.rows }),
       moved: new dyno.DynoSampler2D({ value: this.moved }),
       cell: new dyno.DynoFloat({ value: head.cell }),
       metre: new dyno.DynoFloat({ value: head.metre }),
       corner: new dyno.DynoVec3({ value: new THREE.Vector3(...head.corner) }),
-      limit: new dyno.DynoFloat({ value: head.max_stretch === null ? 1e30 : head.max_stretch ** 2 - 1 }),
+      limit: new dyno.DynoFloat({ value: limitOf(head) }),
       light: new dyno.DynoVec3({ value: new THREE.Vector3() }),
       kind: new dyno.DynoVec4({ value: new THREE.Vector4() }),
     };
@@ -169,10 +128,10 @@ export class Splat {
   }
 
   // Light, as in the head.
-  light({ shader }) {
-    const { light, two_sided, ambient, relative } = shader ?? { light: [0, 0, 1] };
+  light(head) {
+    const { light, kind } = lightOf(head);
     this.inputs.light.value.set(...light);
-    this.inputs.kind.value.set(...[two_sided, ambient, relative, shader !== null].map((value) => Number(value ?? 0)));
+    this.inputs.kind.value.set(...kind);
     this.changed();
   }
 

@@ -1,7 +1,6 @@
 // The live page: draws the states of a simulation that runs on a server, and steers it. See docs/live.md.
 import { Brush } from "./brush.js";
-import { blocks } from "./bundle.js";
-import { reader, writeNodes } from "./gaussians.js";
+import { blocks, readHead, writeNodes } from "./bundle.js";
 import { button, element, make } from "./panel.js";
 import { Tunnel } from "./tunnel.js";
 import { View } from "./view.js";
@@ -97,12 +96,13 @@ class Live {
     else if (kind === "panel") this.showPanel((this.panel = message));
     else if (kind === "painting") this.showPanel(this.panel, (this.painting = message));
     else if (kind === "grabbed") this.tunnel.grabbed(message);
-    else if (kind === "file") this.download(message.name);
     else if (kind === "look") drawing.light(message);
     else if (kind === "colours") drawing.recolour(new Uint32Array(message.rest.buffer, 0, message.count), message.rest.subarray(4 * message.count));
     else if (kind === "scene") await this.open();
     else if (kind === "picture") {
-      const picture = await createImageBitmap(new Blob([message.rest], { type: "image/jpeg" }));
+      const [width, height] = [innerWidth, innerHeight].map((side) => Math.round(side * devicePixelRatio));
+      const size = { resizeWidth: width, resizeHeight: height, resizeQuality: "high" };
+      const picture = await createImageBitmap(new Blob([message.rest], { type: "image/jpeg" }), size);
       const shown = element("picture");
       Object.assign(shown, { width: picture.width, height: picture.height, hidden: false });
       shown.getContext("2d").drawImage(picture, 0, 0);
@@ -118,10 +118,8 @@ class Live {
   }
 
   async open() {
-    const file = blocks("scene.sway");
-    const next = async () => (await file.next()).value;
-    const head = JSON.parse(new TextDecoder().decode(await next()));
-    const stencils = reader(await next())(Uint32Array, 27 * head.stencils);
+    const next = await blocks("scene.sway");
+    const [head, stencils] = await readHead(next);
     this.tunnel.playback.clear();
     await this.view.open(head, stencils, next);
     for (let index = head.start; index < head.parts.length; index++) await this.view.take(index);
@@ -139,7 +137,7 @@ class Live {
 
   showFigures(figures) {
     this.figures = figures;
-    const { loading, notice, problem, broken, paused, speed, rate, pictures, recorded, stretch } = figures;
+    const { loading, notice, problem, broken, paused, speed, rate, pictures, stretch } = figures;
     const remedy = broken ? " Press Reset to start again, or Undo." : "";
     this.tell([problem && problem + remedy, notice].filter(Boolean).join(" "));
     element("loading").hidden = !loading;
@@ -150,7 +148,6 @@ class Live {
     this.tunnel.slow.setAttribute("aria-pressed", String(speed < 1));
     element("undo").disabled = figures.undo === 0;
     const lines = [`${pictures} pictures a second, ${paused ? "paused" : `${rate.toPrecision(2)} × real time`}`];
-    if (recorded !== null) lines.push(`recording ${recorded.toFixed(1)} s`);
     if (!loading) element("figures").textContent = lines.join(", ");
     element("figures").title = `t = ${figures.time.toFixed(2)} s; ${figures.substeps} substeps in a step of ${figures.step.toPrecision(3)} s; stretch ${stretch[0].toFixed(2)} to ${stretch[1].toFixed(2)}`;
   }
@@ -183,7 +180,7 @@ class Live {
     }
     const files = [
       act("restore", "Reset to the configuration", "Wind, material, pins, grid and light as they were at first"),
-      act("record", this.figures?.recorded == null ? "Record a video" : "Stop recording", "It shows simulated time"),
+      act("record", this.recorder ? "Stop recording" : "Record a video", "Of what this window shows"),
       act("live.yaml", "Save the configuration", "For gaussian-swaying sim --config"),
       act("load", panel.elsewhere ? "Load a splat" : "Load a splat or a configuration"),
     ];
@@ -223,7 +220,8 @@ class Live {
       this.showLegend();
       this.tellShown();
     } else if (name === "paint") this.say({ kind: "paint", on: value });
-    else if (["take_back", "apply", "record", "restore"].includes(name)) this.say({ kind: name });
+    else if (["take_back", "apply", "restore"].includes(name)) this.say({ kind: name });
+    else if (name === "record") this.record();
     else if (name === "load") this.file.click();
     else if (["parts.npz", "live.yaml"].includes(name)) this.download(name);
     else this.say({ kind: "set", name, value });
@@ -232,6 +230,21 @@ class Live {
 
   download(name) {
     make("a", { href: `save/${name}`, download: name }).click();
+  }
+
+  // Begin a video of the canvas that is shown, or end it and save it.
+  record() {
+    if (this.recorder) return this.recorder.stop();
+    const parts = [];
+    const recorder = (this.recorder = new MediaRecorder((this.on ? this.view.canvas : element("picture")).captureStream()));
+    recorder.ondataavailable = ({ data }) => parts.push(data);
+    recorder.onstop = () => {
+      this.recorder = null;
+      this.showPanel(this.panel);
+      make("a", { href: URL.createObjectURL(new Blob(parts)), download: "wind.webm" }).click();
+    };
+    recorder.start();
+    this.showPanel(this.panel);
   }
 
   async load(file) {

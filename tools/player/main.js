@@ -16,17 +16,13 @@ const engine = { three, spark: { dyno, SparkRenderer, SplatGenerator }, makeSort
 
 // Plays a .sway file at an address.
 async function playFile(url) {
-  const file = blocks(url);
   const message = element("message");
-  const read = async () => {
-    const { done, value } = await file.next();
-    if (done) throw new Error(`${url} is cut short`);
-    return value;
-  };
-  await play(read, (sentence) => Object.assign(element("note"), { textContent: sentence, hidden: false })).then(
-    () => (message.hidden = true),
-    (error) => (message.textContent = error.message),
-  );
+  try {
+    await play(await blocks(url), (sentence) => Object.assign(element("note"), { textContent: sentence, hidden: false }));
+    message.hidden = true;
+  } catch (error) {
+    message.textContent = error.message;
+  }
 }
 
 Object.assign(window, { engine, playFile, playFilm: play, watchWind: live, swayInWind: sway, Playback });

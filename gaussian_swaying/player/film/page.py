@@ -104,16 +104,15 @@ def page(film: Film) -> str:
 def write_player(folder: Path) -> list[Path]:
     """Write to a folder what plays .sway files elsewhere, and return the files.
 
-    These are ``sway.js`` for scenes of three.js and Spark, and ``gaussian-swaying.js`` with the element
+    These are ``sway.js`` for scenes of three.js and Spark, ``sway-playcanvas.js`` for those of PlayCanvas, and
+    ``gaussian-swaying.js`` with the element
     ``<gaussian-swaying src=...>``, which also shows pages that simulate, and needs ``player.html`` and ``player.js``.
     """
     check_folder(folder / ELEMENT)
-    files = {
-        "sway.js": (PAGE / "sway.min.js").read_text(encoding="utf-8"),
-        ELEMENT: (PAGE / ELEMENT).read_text(encoding="utf-8"),
-        "player.html": filled("file", {"title": "A film", "background": [1.0, 1.0, 1.0]}, {}),
-        "player.js": (PAGE / "film.min.js").read_text(encoding="utf-8"),
-    }
+    sources = {"sway.js": "sway.min.js", "sway-playcanvas.js": "sway-playcanvas.min.js", "player.js": "film.min.js"}
+    sources[ELEMENT] = ELEMENT
+    files = {name: (PAGE / source).read_text(encoding="utf-8") for name, source in sources.items()}
+    files["player.html"] = filled("file", {"title": "A film", "background": [1.0, 1.0, 1.0]}, {})
     for name, text in files.items():
         write_text(folder / name, text)
     return [folder / name for name in files]

@@ -143,7 +143,6 @@ def look_at_camera(
         width: Image width [pixels].
         height: Image height [pixels].
         near: Near plane [scene units]; :data:`NEAR` of the distance when None.
-        device: Device of the matrices.
         dtype: Precision of the matrices; the default precision of torch when None.
 
     Returns:
@@ -209,7 +208,6 @@ def orbit_camera(
         width: Image width [pixels].
         height: Image height [pixels].
         near: Near plane [scene units]; :data:`NEAR` of the distance when None.
-        device: Device of the matrices.
         dtype: Precision of the matrices; the default precision of torch when None.
 
     Returns:

@@ -55,7 +55,6 @@ class CameraPath(Fixed, ABC):
         """Camera of a frame.
 
         Args:
-            frame: Index of the frame.
             time: Time of the frame [s].
             center: Centre of the object [scene units], shape (3,).
             up: Up direction of the scene, shape (3,).

@@ -22,7 +22,6 @@ def interpolate_keys(times: Sequence[float], values: Sequence[Sequence[float]], 
 
     Args:
         times: Increasing times [s], K of them.
-        values: Numbers at each of them, K rows of D.
         time: Time [s].
 
     Returns:

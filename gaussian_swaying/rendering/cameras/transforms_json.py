@@ -34,8 +34,6 @@ def camera_of_transforms(
     ``p1``, ...) is ignored: undistort the images first.
 
     Args:
-        path: The file.
-        data: What :func:`load_transforms` has read.
         frame: Index in its list ``frames``, from 0.
         width: Width of the image to render [pixels]; the intrinsics are rescaled. By default that of the file, or
             the one that keeps the file's aspect ratio when only ``height`` is given.
@@ -55,9 +53,6 @@ def camera_of_transforms(
 
 def load_transforms(path: str | Path) -> dict[str, Any]:
     """Read a ``transforms.json`` of NeRF, Blender or instant-ngp.
-
-    Args:
-        path: The file.
 
     Returns:
         Its fields; ``frames`` is a list of at least one dictionary.

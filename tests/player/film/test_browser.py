@@ -1,7 +1,10 @@
 """A film in a real browser."""
 
 import base64
+import json
 import re
+import subprocess
+import tarfile
 
 import numpy as np
 import pytest
@@ -9,6 +12,7 @@ from browsers import asked_of_a_network, listened, picture_of, until
 from shared import double, longest, peak
 
 from gaussian_swaying.cli.export import main
+from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.player.film import page as film_page
 from gaussian_swaying.player.film.page import PAGE, read_bundle, write_film
 from gaussian_swaying.player.film.recorded import order_of
@@ -65,27 +69,32 @@ def _psnr(one, other):
     return 10 * np.log10(255**2 / np.mean((one - other) ** 2))
 
 
-def test_the_film_is_the_run(show, film, run, make_flag, stretched):
+@pytest.fixture(scope="module")
+def moved(make_flag, stretched):
+    """Places of the Gaussians in some frames of the run, in the order of its film and in its units, by frame."""
+    simulation, found = make_flag(**stretched), {}
+    scene = simulation.scene
+    for frame in simulation.frames(6):
+        means = scene.deformed(frame.state).means.double()[order_of(scene)[1]]
+        found[frame.index] = scene.frame.point_to_sim(means) / (scene.size * scene.frame.metres_per_unit)
+    return found
+
+
+def test_the_film_is_the_run(show, film, run, moved):
     """Centres from the GPU, pictures as those of the run, scrubbing, playing; nothing is asked of a network."""
     import imageio.v3 as iio
 
-    page, simulation = show(film), make_flag(**stretched)
+    page, pictures = show(film), {}
     assert page.evaluate("document.getElementById('message').hidden")
-    scene = simulation.scene
-    size, pictures = scene.size * scene.frame.metres_per_unit, {}
-    for frame in simulation.frames(6):
-        if frame.index not in (0, 2, 5):
-            continue
-        page.evaluate(f"film.seek({frame.index})")
-        assert page.evaluate("film.frame()") == frame.index
+    for frame in (0, 2, 5):
+        page.evaluate(f"film.seek({frame})")
+        assert page.evaluate("film.frame()") == frame
         values = page.evaluate("film.positions().then((found) => Array.from(found))")
-        found = double(values).reshape(-1, 3)
-        expected = scene.frame.point_to_sim(scene.deformed(frame.state).means.double()) / size
-        assert longest(found - expected[order_of(scene)[1]]) < 1e-3  # of the object's size
-        pictures[frame.index] = _picture(page)
-        assert _psnr(pictures[frame.index], iio.imread(run / f"frames/{frame.index:05d}.png")) > 45
+        assert longest(double(values).reshape(-1, 3) - moved[frame]) < 1e-4  # of the object's size
+        pictures[frame] = _picture(page)
+        assert _psnr(pictures[frame], iio.imread(run / f"frames/{frame:05d}.png")) > 45
     assert np.abs(pictures[0] - pictures[5]).max() > 50
-    assert peak(expected - scene.frame.point_to_sim(scene.rest().means.double()) / size) > 0.02
+    assert peak(moved[5] - moved[0]) > 0.02
     before = page.evaluate("film.drawn()")
     page.evaluate("film.play()")
     until(lambda: page.evaluate("film.drawn()") >= before + 5)
@@ -94,94 +103,161 @@ def test_the_film_is_the_run(show, film, run, make_flag, stretched):
 
 
 @pytest.fixture
-def own_scene(browser, run, tmp_path, request):
-    """Opens the page of a user with three.js, Spark and sway.js, which a server has beside a film."""
+def served(browser, run, tmp_path):
+    """Opens a page beside a film and what ``--player`` wrote; programs of engines are at other addresses."""
     write_film(run, tmp_path / "flag.sway")
     assert main(["--player", str(tmp_path)]) == 0
-    example, program = (request.config.rootpath / name for name in ("examples/web/three.html", "tools/player/main.js"))
-    names = {
-        "three": re.search(r"const three = \{(.*)\}", program.read_text(encoding="utf-8"))[1],
-        "spark": "dyno, SplatGenerator",
-    }
+    page = listened(browser.new_page(viewport={"width": 320, "height": 180}))
+    page.add_init_script(path=PAGE / "film.min.js")
+    kinds = {".html": "text/html", ".js": "text/javascript", ".sway": "application/vnd.gaussian-swaying"}
+
+    def served(text, **engines):
+        def serve(route):
+            other, _, own = route.request.url.partition("http://own.test/")
+            path = tmp_path / own.partition("?")[0]
+            if other:
+                body = next(body for name, body in engines.items() if f"{name}@" in other)
+                headers = {"Access-Control-Allow-Origin": "*"}
+                route.fulfill(body=body, content_type="text/javascript", headers=headers)
+            elif path.is_file():
+                route.fulfill(body=path.read_bytes(), content_type=kinds[path.suffix])
+            else:
+                route.fulfill(status=404)
+
+        (tmp_path / "index.html").write_text(text)
+        page.route("**/*", serve)
+        page.goto("http://own.test/index.html")
+        return page
+
+    yield served
+    assert page.problems == []
+    page.close()
+
+
+@pytest.fixture
+def three(request):
+    """Three.js and Spark, which our player has inside."""
+    text = (request.config.rootpath / "tools/player/main.js").read_text(encoding="utf-8")
+    names = re.search(r"const three = \{(.*)\}", text)[1]
     sorted_by_script = (  # as the engine here has no WebAssembly
         "export class SparkRenderer extends window.engine.spark.SparkRenderer {"
         " constructor(options) { super(options); this.sortWorker = window.engine.makeSorter(); } }"
     )
-    more = {"spark": sorted_by_script}
-    page = listened(browser.new_page(viewport={"width": 320, "height": 180}))
-
-    def serve(route):
-        path = route.request.url.removeprefix("http://own.test/")
-        engine = next((name for name in names if path.startswith("http") and name in path), None)
-        if engine is not None:
-            text = f"export const {{ {names[engine]} }} = window.engine.{engine};" + more.get(engine, "")
-            route.fulfill(body=text, content_type="text/javascript", headers={"Access-Control-Allow-Origin": "*"})
-        elif path == "":
-            route.fulfill(body=example.read_bytes(), content_type="text/html")
-        elif (tmp_path / path).is_file():
-            kind = "text/javascript" if path.endswith(".js") else "application/octet-stream"
-            route.fulfill(body=(tmp_path / path).read_bytes(), content_type=kind)
-        else:
-            route.fulfill(status=404)
-
-    page.add_init_script(path=PAGE / "film.min.js")
-    page.route("**/*", serve)
-    page.goto("http://own.test/")
-    yield page
-    page.close()
+    return {
+        "three": f"export const {{ {names} }} = window.engine.three;",
+        "spark": f"export const {{ dyno, SplatGenerator }} = window.engine.spark; {sorted_by_script}",
+    }
 
 
-def test_a_scene_of_ones_own_plays_a_bundle(own_scene, tmp_path):
-    """In three.js with Spark, with places as the GPU computed them."""
-    page, film = own_scene, read_bundle(tmp_path / "flag.sway")
-    until(lambda: page.evaluate("window.shown?.splat.duration > 0"))
-    page.evaluate("shown.splat.complete")
-    assert page.evaluate("shown.splat.duration") == pytest.approx(0.24)
+@pytest.fixture
+def playcanvas(request, tmp_path):
+    """PlayCanvas from npm, in the version that the player is built with."""
+    lock = json.loads((request.config.rootpath / "tools/player/package-lock.json").read_text(encoding="utf-8"))
+    known = lock["packages"]["node_modules/playcanvas"]
+    command = ["npm", "pack", "--json", f"playcanvas@{known['version']}"]
+    try:
+        told = subprocess.run(command, cwd=tmp_path, capture_output=True, timeout=200, check=True).stdout
+    except (OSError, subprocess.SubprocessError):
+        pytest.skip("needs npm and its registry")
+    (packed,) = json.loads(told)
+    assert packed["integrity"] == known["integrity"]
+    with tarfile.open(tmp_path / packed["filename"]) as archive:
+        return {"playcanvas": archive.extractfile("package/build/playcanvas.min.mjs").read()}
 
-    def places():
-        found = page.evaluate("Array.from(engine.positionsOf(shown.renderer, shown.spark, shown.splat.head.count))")
-        return double(found).reshape(-1, 3)
 
-    until(lambda: page.evaluate("shown.spark.activeSplats") > 0)
-    fifth, second = film.moved(5)[0], film.moved(2)[0]
-    page.evaluate("window.stopped = 0.24 + 0.2")
-    until(lambda: longest(places() - fifth) < 1e-4)
-    page.evaluate("window.stopped = 0.24 + 0.08")
-    until(lambda: longest(places() - second) < 1e-4)
-    assert longest(fifth - second) > 0.01
-    assert page.problems == []
+ELEMENT = '<!doctype html><script src="gaussian-swaying.js"></script><gaussian-swaying src="{}"></gaussian-swaying>'
+DRAWN = {
+    "three": """async () => shown.spark.activeSplats > 0
+        ? Array.from(engine.positionsOf(shown.renderer, shown.spark, shown.splat.head.count)) : []""",
+    "playcanvas": """async () => {
+        if (!(shown.splat.sorted >= 0)) return [];
+        const [camera] = shown.app.renderer.gsplatDirector.camerasMap.values();
+        const [{ gsplatManager }] = camera.layersMap.values();
+        const made = gsplatManager.world.workBuffer.getTexture("dataTransformA");
+        const found = new Float32Array((await made.read(0, 0, made.width, made.height)).buffer);
+        return Array.from({ length: 3 * shown.splat.container.numSplats }, (_, k) => {
+            const i = 4 * Math.floor(k / 3); // y is up there
+            return [found[i], -found[i + 2], found[i + 1]][k % 3];
+        });
+    }""",
+}
+
+
+@pytest.fixture
+def example(request, served):
+    """Opens an example with an engine of its own, once its film has come."""
+
+    def example(name):
+        text = (request.config.rootpath / f"examples/web/{name}.html").read_text(encoding="utf-8")
+        page = served(text, **request.getfixturevalue(name))
+        until(lambda: page.evaluate("window.shown?.splat?.duration > 0"))
+        assert page.evaluate("shown.splat.complete.then(() => shown.splat.duration)") == pytest.approx(0.24)
+        return page
+
+    return example
+
+
+def _shown(page, name, frame):
+    """Rows of places that an example draws at a time after the first round, which may be those of a time before."""
+    page.evaluate(
+        "(time) => Object.assign(shown.splat, { playing: false, time: (window.stopped = time) })", 0.24 + 0.04 * frame
+    )
+    return page.evaluate(DRAWN[name])
+
+
+@pytest.mark.parametrize("name", ["element", *DRAWN])
+def test_players_agree(name, served, example, moved, tmp_path):
+    """Centres from the GPU, within 0.01 % of the size of those of the run, and of the film as numpy reads it."""
+    if name == "element":
+        page = served(ELEMENT.format("flag.sway"))
+        until(lambda: len(page.frames) == 2 and page.frames[1].evaluate("!!window.film"))
+        drawn = "async (frame) => { await film.seek(frame); return Array.from(await film.positions()); }"
+    else:
+        page = example(name)
+    film = read_bundle(tmp_path / "flag.sway")
+
+    def agrees(frame, expected):
+        values = page.frames[1].evaluate(drawn, frame) if name == "element" else _shown(page, name, frame)
+        found = double(values).reshape(-1, 3)
+        return len(found) > 0 and longest(found - expected) < 1e-4
+
+    for frame in (5, 2):
+        until(lambda frame=frame: agrees(frame, film.moved(frame)[0]))
+        assert agrees(frame, moved[frame])
+    assert longest(moved[5] - moved[2]) > 0.01
+
+
+def test_playcanvas_has_the_shapes_of_a_film(example, tmp_path):
+    """Rotations and sizes where the limit of stretch does nothing, and colours where light does nothing."""
+    page, film = example("playcanvas"), read_bundle(tmp_path / "flag.sway")
+    until(lambda: len(_shown(page, "playcanvas", 2)) > 0)
+    read = """async (name) => {
+        const made = shown.splat.container.getTexture(name);
+        return Array.from(await made.read(0, 0, made.width, made.height));
+    }"""
+    turn, size, color = (
+        double(np.array(page.evaluate(read, f"data{name}"), np.uint16).view(np.float16)).reshape(-1, 4)[
+            : film.head["count"]
+        ]
+        for name in ("Rotation", "Scale", "Color")
+    )
+    expected, rest = film.moved(2)[1], film.moved(0)[1]
+    trace, before = (shape.diagonal(dim1=-2, dim2=-1).sum(-1) for shape in (expected, rest))
+    free = trace < before * film.head["max_stretch"] ** 2
+    assert free.double().mean() > 0.5
+    error = (covariance(turn, size[:, :3].log()) - expected).abs().amax((-1, -2)) / trace
+    assert peak(error[free]) < 2e-3
+    still = film.head["moving"]
+    assert peak(color[still:] - double(film.color[still:]) / 255) < 1e-3
+
+
+def test_a_film_that_is_not_there_is_said(served, three, request):
+    page = served((request.config.rootpath / "examples/web/three.html").read_text(encoding="utf-8"), **three)
+    until(lambda: page.evaluate("!!window.shown"))
     wrong = page.evaluate("(new shown.splat.constructor('none.sway')).complete.catch(({ message }) => message)")
     assert wrong == "none.sway cannot be read (404)"
-
-
-def test_an_element_plays_a_bundle(browser, run, tmp_path):
-    """In a page of a user's, beside what `--player` wrote; a file that is not there is said."""
-    write_film(run, tmp_path / "flag.sway")
-    assert main(["--player", str(tmp_path)]) == 0
-    page = listened(browser.new_page(viewport={"width": 320, "height": 180}))
-
-    def serve(route):
-        path = tmp_path / route.request.url.removeprefix("http://own.test/").partition("?")[0]
-        kinds = {".html": "text/html", ".js": "text/javascript", ".sway": "application/vnd.gaussian-swaying"}
-        if path.is_file():
-            route.fulfill(body=path.read_bytes(), content_type=kinds[path.suffix])
-        else:
-            route.fulfill(status=404)
-
-    for name, film in (("whole", "flag.sway"), ("none", "none.sway")):
-        element = f'<gaussian-swaying src="{film}"></gaussian-swaying>'
-        (tmp_path / f"{name}.html").write_text(f'<!doctype html><script src="gaussian-swaying.js"></script>{element}')
-    page.route("http://own.test/**", serve)
-    page.goto("http://own.test/whole.html")
-    until(lambda: len(page.frames) == 2 and page.frames[1].evaluate("!!window.film"))
-    assert page.frames[1].evaluate("film.seek(5).then(() => film.frame())") == 5
-    found = double(page.frames[1].evaluate("film.positions().then((found) => Array.from(found))")).reshape(-1, 3)
-    assert longest(found - read_bundle(tmp_path / "flag.sway").moved(5)[0]) < 1e-3  # whose stretch has no limit
-    assert page.problems == []
-    page.goto("http://own.test/none.html")
-    message = page.frame_locator("iframe").locator("#message")
+    message = served(ELEMENT.format("none.sway")).frame_locator("iframe").locator("#message")
     message.filter(has_text="none.sway cannot be read (404)").wait_for()
-    page.close()
 
 
 def test_gaussians_are_sorted_from_far_to_near(show, film):

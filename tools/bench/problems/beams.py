@@ -243,8 +243,6 @@ class Strip:
         volume: Volumes, for a width of one, shape (P,).
         free: Points that are not held, bool, shape (P,).
         edge: Where the free length begins: halfway between the last held and the first free points.
-        span: The free length.
-        thickness: Thickness.
         moment: Second moment of area of the layers.
     """
 

@@ -112,10 +112,8 @@ class Run:
     """The result of a rollout.
 
     Attributes:
-        state: The last state.
         time: Times of the observations [s], shape (N,), including the start.
         series: The observations, shape (N, ...).
-        substeps: Number of substeps.
         wall_s: Wall-clock time of the rollout [s].
     """
 

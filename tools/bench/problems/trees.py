@@ -192,7 +192,6 @@ class Swaying:
     """A tree on a grid with its first mode.
 
     Attributes:
-        points: Its points.
         force: The air on its leaves.
         omega: Circular frequency of the frame's first mode [1/s].
         shape: Motion of the points in that mode, 1 at the top of the stem along x, shape (P, 3).

@@ -1,5 +1,5 @@
 // The page in which the visitor turns the wind: draws what the solver in the worker computes. See docs/web.md.
-import { reader } from "../gaussians.js";
+import { readHead } from "../bundle.js";
 import { element } from "../panel.js";
 import { Tunnel } from "../tunnel.js";
 import { View } from "../view.js";
@@ -19,8 +19,7 @@ function startWorker(program) {
  * @param {(sentence: string) => void} tell shows a sentence
  */
 export async function sway(read, tell) {
-  const head = JSON.parse(new TextDecoder().decode(await read("head")));
-  const stencils = reader(await read("stencils"))(Uint32Array, 27 * head.stencils);
+  const [head, stencils] = await readHead(read);
   const view = new View(element("canvas"));
   const worker = startWorker(await read("worker"));
   const state = { failed: null, rate: null, message: "", solver: "", why: null };
