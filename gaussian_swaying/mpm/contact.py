@@ -300,13 +300,16 @@ class ContactRun:
         whole: dict[str, Any] = {"dtype": torch.int32}
         self.before, self.motion = self._zeros(len(active), 3), self._zeros(1)
         self.last = (1 << max(many - 1, 0).bit_length()) - 1
-        self.table = torch.arange(self.last + int(kernels.COLUMNS.value) + 2, device=self.device)
-        self.near, self.many = self._zeros(many, **whole), self._zeros(many, **whole)
+        self.table = torch.arange(self.last + int(kernels.COLUMNS.value) + 2, device=self.device).int()
+        self.hashes, self.order, self.near, self.many = (self._zeros(many, **whole) for _ in range(4))
+        self.start, self.low, self.limit = torch.zeros_like(self.table), self._zeros(3), self._zeros(1)
+        self.cells, self.ordered = self._zeros(4, many), self._zeros(4, many)
         self.total = self._zeros(len(fields))
         self.row, self.moving, self.impulse = self._zeros(many, 8), self._zeros(many, 4), self._zeros(many, 8)
         self.peak = self._zeros(4, int(kernels.MOST_PROGRAMS.value))
         self.gate, self.status = self._zeros(1, **whole), self._zeros(8, **whole)
-        self.margin, self.interval, self.used = REACHES * stage.reach, 4, 1
+        self.interval, self.used = 4, 1
+        self._take_margin(0.0)
         self.wall_gap, self.wall_valid = self._zeros(max(walls, 1), many), self._zeros(max(walls, 1), many)
         self.wall_normal, self.wall_drive = self._zeros(max(walls, 1), many, 3), self._zeros(max(walls, 1), many, 3)
         self.pressed = self._zeros(max(walls, 1), many, 3)
@@ -323,7 +326,7 @@ class ContactRun:
         ]
         """For each obstacle its numbers; None for one that runs in torch."""
         self.programs = self._programs()
-        self._take_room(*((ROOM, SLOTS) if stage.contact is not None else (1, walls)))
+        self.take_room(*((ROOM, SLOTS) if stage.contact is not None else (1, walls)))
 
     def _zeros(self, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
         return torch.zeros(shape, dtype=dtype or self.fields.dtype, device=self.device)
@@ -336,7 +339,7 @@ class ContactRun:
         needed = max(-(-max(self.places, len(self.active)) // BLOCK), -(-len(self.touched) // TALL))
         return max(1, min(room, needed, int(kernels.MOST_PROGRAMS.value)))
 
-    def _take_room(self, room: int, slots: int) -> None:
+    def take_room(self, room: int, slots: int) -> None:
         """Make the buffers whose size depends on how crowded the surface is; if they are refused, the old ones stay."""
         places, planes = self.places, int(kernels.PLANES.value)
         for needed in (kernels.NEEDED_ROOM, kernels.NEEDED_SLOTS):
@@ -350,6 +353,10 @@ class ContactRun:
         self.candidates = self._zeros(places, self.room, dtype=torch.int32)
         self.other = self._zeros(self.slots, places, dtype=torch.int32)
         self.data = self._zeros(planes, self.slots, places)
+
+    def _take_margin(self, margin: float) -> None:
+        self.margin = max(REACHES * self.stage.reach, margin)
+        self.limit.fill_(self.stage.reach + SLACK * self.stage.dx + self.margin)
 
     @property
     def key(self) -> tuple[object, ...]:
@@ -376,11 +383,11 @@ class ContactRun:
         moved, fits = float(self.motion), True
         if moved < 1e9:  # a run that diverges is not repeated
             fits, step = moved <= self.margin, SURE * max(moved / self.used, 1e-9)
-            self.margin = max(REACHES * self.stage.reach, step)
+            self._take_margin(step)
             self.interval = min(LONGEST, int(self.margin / step))
         if room <= self.room and slots <= self.slots:
             return fits
-        self._take_room(max(self.room, 1 << (room - 1).bit_length()), max(self.slots, 1 << (slots - 1).bit_length()))
+        self.take_room(max(self.room, 1 << (room - 1).bit_length()), max(self.slots, 1 << (slots - 1).bit_length()))
         return False
 
     def due(self, steps: int) -> range:
@@ -391,23 +398,24 @@ class ContactRun:
     def make_lists(self, _: int = 1) -> None:
         """List the samples that may touch before a node moves by half the margin; can be recorded."""
         stage, places, block = self.stage, self.places, lanes(self.device, BLOCK, 1)
-        self.before.copy_(self.fields[self.active.long(), :3])
         self._read()
-        limit = stage.reach + SLACK * stage.dx + self.margin
-        columns, cell = int(kernels.COLUMNS.value), (self.position - self.position.amin(0)) / limit
-        x, y, z = (cell.nan_to_num(0.0).clamp(max=columns - 3.0) + 1).long().unbind(1)
-        table, order = ((((x * 73856093) ^ (y * 19349663)) & self.last) + z).sort(stable=True)
-        start = torch.searchsorted(table, self.table, out_int32=True)
+        self.low.copy_(self.position.amin(0))
+        self.status[int(kernels.LISTED.value)].zero_()
+        every, one = max(places, len(self.active)), lanes(self.device, BLOCK)
+        launch(kernels.contact_cells, (-(-every // one),))(
+            self.fields, self.active, len(self.active), self.before, self.position, self.low, self.limit, self.cells,
+            self.hashes, places, self.last, BLOCK=one, num_warps=2,
+        )  # fmt: skip
+        cells, order = self.hashes.sort(stable=True)
+        self.order.copy_(order)
+        torch.index_select(self.cells, 1, order, out=self.ordered)
+        torch.searchsorted(cells, self.table, out_int32=True, out=self.start)
         launch(kernels.contact_lists, (-(-places // block),))(
-            self.position, self.rest, self.base, self.corner, torch.stack([x, y, z], 1).int(), start, order.int(),
-            self.position[order], (x * columns + y)[order].int(), self.candidates, self.near, places,
-            self.room, limit, stage.apart, stage.reach, self.last, VIRTUAL=self.virtual, BLOCK=block,
+            self.position, self.rest, self.base, self.corner, self.low, self.limit, self.start, self.order,
+            self.ordered, self.candidates, self.near, self.many, self.impulse, self.status, places, self.room,
+            stage.apart, stage.reach, self.last, VIRTUAL=self.virtual, BLOCK=block,
             WIDE=lanes(self.device, WIDE_SEARCH), **_LAUNCH,
         )  # fmt: skip
-        self.status[:2].copy_(torch.stack([self.near.sum(), self.near.amax().maximum(self.status[1])]))
-        self.near.clamp_(max=self.room)
-        self.many.zero_()
-        self.impulse.zero_()
 
     def _read(self) -> None:
         """Read the positions and velocities of all contact samples from the nodes."""

@@ -173,40 +173,83 @@ COLUMNS = tl.constexpr(1024)
 """Most cells of the grid along an axis; farther samples count to the last one."""
 
 
+@triton.jit
+def cell_of(x, low, inverse):
+    """Cells of places along an axis, from 1 on; where there is no number, the last one."""
+    t = (x - low) * inverse
+    return tl.where(t < COLUMNS - 3, t, COLUMNS - 3).to(tl.int32) + 1
+
+
+@triton.jit
+def column_of(cx, cy):
+    """The number of a column of cells, exact in single precision."""
+    return (cx * COLUMNS + cy).to(tl.float32)
+
+
+@triton.jit
+def hashed(cx, cy, last):
+    """Entry of a column of cells."""
+    return ((cx * 73856093) ^ (cy * 19349663)) & last
+
+
+@triton.jit(do_not_specialize=CHANGES)
+def contact_cells(
+    fields, active, active_nodes, before, position, low, limit, cells, hashes, places, last, BLOCK: tl.constexpr
+):
+    """Write the places of samples with their columns, what they are sorted by, and where the nodes are now."""
+    p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mask = p < active_nodes
+    at = fields + tl.load(active + p, mask, 0) * 8
+    for c in tl.static_range(3):
+        tl.store(before + p * 3 + c, tl.load(at + c, mask, 0.0), mask)
+    mask = p < places
+    inverse = 1 / tl.load(limit)
+    x = vector(position + p * 3, mask)
+    cx = cell_of(x[0], tl.load(low), inverse)
+    cy = cell_of(x[1], tl.load(low + 1), inverse)
+    for c in tl.static_range(3):
+        tl.store(cells + c * places + p, x[c], mask)
+    tl.store(cells + 3 * places + p, column_of(cx, cy), mask)
+    tl.store(hashes + p, hashed(cx, cy, last) + cell_of(x[2], tl.load(low + 2), inverse), mask)
+
+
 @triton.jit(do_not_specialize=CHANGES)
 def contact_lists(
-    position, rest, base, corner, cell, start, ordered, sorted_, column, candidates, near, places, room, limit, apart,
-    beside, last, VIRTUAL: tl.constexpr, BLOCK: tl.constexpr, WIDE: tl.constexpr,
+    position, rest, base, corner, low, limit, start, order, ordered, candidates, near, many, impulse, status, places,
+    room, apart, beside, last, VIRTUAL: tl.constexpr, BLOCK: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
     """List the samples closer than ``limit`` to each that were at least ``apart`` from it at rest, and count them.
 
-    ``start`` is where the samples of a cell begin in their order, in a table of hashed columns of cells: the three
+    ``start`` is where the samples of a cell begin in their ``order``, in a table of hashed columns of cells: the three
     cells of a column around a sample follow each other. Another column may have the same entry. With VIRTUAL also
-    those that were at least ``beside`` from it, and have another copy of a node that both reach.
+    those that were at least ``beside`` from it, and have another copy of a node that both reach. Nothing acts on them.
     """
     wide = tl.arange(0, WIDE)[None, :]
     p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = p < places
-    x = tl.load(position + p * 3, mask, 0.0)[:, None]
-    y = tl.load(position + p * 3 + 1, mask, 0.0)[:, None]
-    z = tl.load(position + p * 3 + 2, mask, 0.0)[:, None]
+    x = vector(position + p * 3, mask)
     r = load3(rest, places, p, mask)
+    size = tl.load(limit)
+    inverse = 1 / size
+    x_cell = cell_of(x[0], tl.load(low), inverse)
+    y_cell = cell_of(x[1], tl.load(low + 1), inverse)
+    z_cell = cell_of(x[2], tl.load(low + 2), inverse)
     found = tl.zeros([BLOCK], tl.int32)
     for beside_it in range(9):
-        cx = tl.load(cell + p * 3, mask, 1) + beside_it // 3 - 1
-        cy = tl.load(cell + p * 3 + 1, mask, 1) + beside_it % 3 - 1
-        at = start + (((cx * 73856093) ^ (cy * 19349663)) & last) + tl.load(cell + p * 3 + 2, mask, 1)
+        cx = x_cell + (beside_it // 3 - 1)
+        cy = y_cell + (beside_it % 3 - 1)
+        at = start + hashed(cx, cy, last) + z_cell
         begin = tl.load(at - 1, mask, 0)
-        many = tl.load(at + 2, mask, 0) - begin
-        for k in range(0, tl.max(many), WIDE):
-            known = (k + wide) < many[:, None]
+        length = tl.load(at + 2, mask, 0) - begin
+        for k in range(0, tl.max(length), WIDE):
+            known = (k + wide) < length[:, None]
             e = begin[:, None] + k + wide
-            known = known & (tl.load(column + e, known, -1) == (cx * COLUMNS + cy)[:, None])
-            q0 = tl.load(sorted_ + e * 3, known, 0.0) - x
-            q1 = tl.load(sorted_ + e * 3 + 1, known, 0.0) - y
-            q2 = tl.load(sorted_ + e * 3 + 2, known, 0.0) - z
-            known = known & (q0 * q0 + q1 * q1 + q2 * q2 < limit * limit)
-            q = tl.load(ordered + e, known, 0)
+            known = known & (tl.load(ordered + 3 * places + e, known, 0.0) == column_of(cx, cy)[:, None])
+            q0 = tl.load(ordered + e, known, 0.0) - x[0][:, None]
+            q1 = tl.load(ordered + places + e, known, 0.0) - x[1][:, None]
+            q2 = tl.load(ordered + 2 * places + e, known, 0.0) - x[2][:, None]
+            known = known & (q0 * q0 + q1 * q1 + q2 * q2 < size * size)
+            q = tl.load(order + e, known, 0)
             q0 = tl.load(rest + q, known, 0.0) - r[0][:, None]
             q1 = tl.load(rest + places + q, known, 0.0) - r[1][:, None]
             q2 = tl.load(rest + 2 * places + q, known, 0.0) - r[2][:, None]
@@ -227,7 +270,13 @@ def contact_lists(
             to = found[:, None] + tl.cumsum(hit, 1) - hit
             tl.store(candidates + p[:, None] * room + to, q, known & (to < room))
             found += tl.sum(hit, 1)
-    tl.store(near + p, found, mask)
+    tl.store(near + p, tl.minimum(found, room), mask)
+    tl.store(many + p, tl.zeros([BLOCK], tl.int32), mask)
+    for c in tl.static_range(8):
+        tl.store(impulse + p * 8 + c, tl.zeros([BLOCK], tl.float32), mask)
+    found = tl.where(mask, found, 0)
+    tl.atomic_add(status + LISTED, tl.sum(found), sem="relaxed")
+    tl.atomic_max(status + NEEDED_ROOM, tl.max(found), sem="relaxed")
 
 
 PLANES = tl.constexpr(10)

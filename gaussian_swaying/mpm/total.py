@@ -636,7 +636,7 @@ class TotalRun(Run):
             if mark in part.looks:
                 self.repeater.run(1, "look", lambda _: self._look(), launches=True)
             if mark in due and touching is not None:
-                self.repeater.run(1, ("lists", *touching.key, touching.margin), touching.make_lists)
+                self.repeater.run(1, ("lists", *touching.key), touching.make_lists)
         if self.count > RECORDED:
             found = torch.empty(self.room, **self.like)
             self._read(found, part)

@@ -41,8 +41,6 @@ def check(simulation: Simulation) -> None:
     sways = solver.formulation == "modes"
     if not sways and solver.formulation != "total":
         raise _refused(f"`solver.formulation: {solver.formulation}`", "set it to total")
-    if model.scene.surface_places is not None and model.scene.surface_places.contact is not None:
-        raise _refused("`contact` of the material with itself", "set `contact` to null")
     if simulation.stepper.copies is not None:
         raise _refused("`copies`", "leave them out")
     if simulation.editor.edits:
@@ -142,7 +140,7 @@ def _shapes(bound: Modes, nodes: Tensor) -> dict[str, Tensor]:
     omega = bound.square.sqrt()
     every = [bound._everywhere(x.unflatten(-2, (-1, 3)).flatten(-2))[nodes] for x in (bound.shape, bound.turn)]
     shown = torch.cat([x.reshape(-1, len(omega)) for x in every])
-    arrays = {"omega": omega, "mass": bound.site_mass, "order": torch.arange(bound.sites)}
+    arrays = {"omega": omega, "mass": bound.site_mass, "sorted": torch.arange(bound.sites)}
     for name, shape in {"sites": bound.site_modes, "nodes": shown}.items():
         scaled = shape.double() / omega  # loads of one size move a mode by 1 / omega^2, at a rate of 1 / omega
         largest = scaled.abs().amax(-1, keepdim=True)  # that of a speck may be a hundred times the usual one

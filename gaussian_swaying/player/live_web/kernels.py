@@ -18,6 +18,7 @@ from gaussian_swaying.kernels.cpu import Noted, noted
 from gaussian_swaying.kernels.launch import lanes, launch, narrowed
 from gaussian_swaying.kernels.wgsl import shaders
 from gaussian_swaying.mpm import modal_kernels as modal
+from gaussian_swaying.mpm.contact import LONGEST, SURE, ContactRun
 from gaussian_swaying.mpm.device_functions import Composed, DeviceFunction, Packed
 from gaussian_swaying.mpm.dispatch import in_common
 from gaussian_swaying.mpm.forces import MOST_STEPS, Force
@@ -34,6 +35,12 @@ from gaussian_swaying.wind.turbulence import Turbulence
 
 Passes = dict[str, list[Noted]]
 Looks = list[tuple[Any, Tensor, Tensor]]
+
+MORE = 4
+"""Room for what touches, which cannot grow in a page, as a multiple of what a run starts with."""
+
+LISTED = ("low", "limit", "hashes", "cells", "order", "ordered", "start", "status", "motion")
+"""Tables of what makes the lists, see ``ContactRun.make_lists``."""
 
 ROWS = 16
 """Rows of held points that a shader loads at once."""
@@ -53,11 +60,17 @@ def pack_total(bound: Total, forces: Sequence[Force], wind: WindField) -> tuple[
         held = run.options_for([*functions, still_pull(bound.points.mass.shape)])
         free = run.options_for(functions)
         run.begin(1, False)
-        if run.touching is not None:
-            run.touching.take(run.time, run.dt, 1)
+        touching = run.touching
+        contact: dict[str, Any] = {}
+        lists: Passes = {}
+        if touching is not None:
+            touching.take(run.time, run.dt, 1)
+            if bound.contact is not None and bound.contact.contact is not None:
+                contact, lists = _listed(touching)
+                tables |= {"samples": touching.position, **{name: getattr(touching, name) for name in LISTED}}
         fastest = torch.zeros(2, **run.like)
         looks = _looks(run, fastest)
-        passes = _substeps(run, free, held) | _seen(run, looks)
+        passes = _substeps(run, free, held) | _seen(run, looks) | lists
         tables |= {
             "fields": run.fields,
             "schedule": run.schedule,
@@ -78,8 +91,9 @@ def pack_total(bound: Total, forces: Sequence[Force], wind: WindField) -> tuple[
             single |= _seen(run, looks)
         layouts = free["FORCES"], held["FORCES"]
         head, arrays, place = _packed(passes | blow, tables, run.loads, layouts, wind, single)
-    arrays |= {"order": run.order}
-    if run.touching is not None:
+    arrays |= {"sorted": run.order}
+    if touching is not None:
+        head["contact"] = contact
         head["kernels"]["shaders"] = "something touches the material"
         return head, arrays
     try:
@@ -169,6 +183,17 @@ def pack_modes(
         note("show", modal.modal_shown, (-(-nodes // block),), moved["n"], tables["shown"], nodes)
         head, arrays, _ = _packed(passes, tables, own.loads, layouts, wind)
     return head, arrays
+
+
+def _listed(touching: ContactRun) -> tuple[dict[str, Any], Passes]:
+    """How lists are made of the samples that may touch, and the kernels: the page sorts samples in between."""
+    touching.take_room(MORE * touching.room, MORE * touching.slots)
+    with noted() as made:
+        touching.make_lists()
+    gap = float(touching.limit) - touching.margin
+    head = {"gap": gap, "least": touching.margin, "sure": SURE, "longest": LONGEST, "interval": touching.interval}
+    head |= {"room": touching.room, "slots": touching.slots}
+    return head, {name: [one] for name, one in zip(("place", "cell", "list"), made, strict=True)}
 
 
 def _functions(forces: Sequence[Force]) -> list[DeviceFunction]:

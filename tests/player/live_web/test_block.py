@@ -13,6 +13,7 @@ from gaussian_swaying.mpm.forces import Force
 from gaussian_swaying.mpm.laws.elastic import NeoHookean
 from gaussian_swaying.player.live_web.block import check
 from gaussian_swaying.player.live_web.page import PAGE
+from gaussian_swaying.scenes.demo import DemoScene
 from gaussian_swaying.scenes.procedural import FlagScene
 
 from .conftest import SIDE, apart, moved_means
@@ -157,6 +158,35 @@ def test_a_rider_on_the_ground(make, in_node, tmp_path):
     assert error < 1e-4
 
 
+def box(low, high):
+    return {"class_path": "Box", "init_args": {"min": low, "max": high}}
+
+
+def test_a_ball_on_a_cloth(make, in_node, tmp_path):
+    """It sinks onto the cloth, and dents it; without contact it falls through."""
+    made = DemoScene("ball_on_cloth", spacing=0.04, size=0.8).generate()
+    means = made.means.clone()
+    means[:, 2] -= torch.where(means[:, 2] > 0.6, 0.13, 0.0)  # as low as it may be without sharing nodes
+    write_ply(tmp_path / "ball.ply", replace(made, means=means))
+    parts = [box([-0.39, -0.39, 0.495], [0.39, 0.39, 0.505]), box([-0.3, -0.3, 0.51], [0.3, 0.3, None])]
+    region = {"class_path": "Union", "init_args": {"regions": parts}}
+    scene = {"generator": None, "ply": str(tmp_path / "ball.ply"), "region": region, "filling": {"votes": 0.6}}
+    rim = {"class_path": "Not", "init_args": {"region": box([-0.36, -0.36, None], [0.36, 0.36, None])}}
+    pin = {"class_path": "PinnedRegion", "init_args": {"region": rim}}
+    changes = {"scene": scene | {"metres_per_unit": 1.0}, "material": {"density": 50.0}}
+    solver = {"boundaries": [pin], "dx": 0.05, "damping": 8.0, "gravity": [0.0, 0.0, -1.0]}
+    changes |= {"solver": solver, "wind": {"flow": [0.3, 0.0, 0.0], "modulations": []}}
+    simulation = make(**changes, contact={"thickness": 0.02})
+    state, steps = run(simulation, 50)
+    told, moved = in_node(simulation, {"kind": "frames", "count": 50})
+    error, motion = apart(simulation, state, moved)
+    print("ERR", error, motion)
+    fallen, _ = run(make(**changes), 50)
+    assert longest(fallen.position - state.position) > 0.1 * motion
+    assert error < 1e-4
+    assert told[0]["substeps"] == steps
+
+
 ROUNDED = 2.5e-3
 """Of the motion: shapes are rounded to some thousandths, and turbulence to a sixteenth of its standard deviation."""
 
@@ -241,7 +271,6 @@ class Lift(Force):
 BALL = {"class_path": "Sphere", "init_args": {"center": [0.4, 0.4, 0.0], "radius": 0.1}}
 REFUSED = {
     "solver.formulation": {"solver": {"formulation": "updated"}},
-    "contact": {"contact": {"thickness": 0.01}},
     "path": {
         "solver": {
             "boundaries": [

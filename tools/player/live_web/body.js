@@ -53,7 +53,7 @@ export class Body {
     if (!pull) return;
     times.forEach((_, k) => tables.winds.set(pull.target, width * k + column));
     const values = tables.values.subarray(points * row);
-    this.a.order.forEach((own, p) => {
+    this.a.sorted.forEach((own, p) => {
       for (let m = 0; m < 3; m++) values[m * points + p] = pull.offset[3 * own + m];
       values[3 * points + p] = pull.held[own];
     });

@@ -27,6 +27,9 @@ export class Solver extends Body {
     this.tables.fields.fill(0);
     this.tables.velocity.fill(0);
     this.substep = 0; // the last one [s]
+    this.tables.status?.fill(0);
+    const { least, interval } = this.head.contact ?? {};
+    this.trust(least, interval);
     /** The last measurement: when, the square of the fastest wave [m²/s²], and that of the largest stretch. */
     this.seen = { time: NaN, wave: 0, stretch: 1 };
   }
@@ -59,16 +62,19 @@ export class Solver extends Body {
     if (this.seen.time !== time) this.measure();
     let steps = this.substeps(cfl);
     this.steps ??= steps;
-    for (let retry = 0; ; retry++) {
+    for (let retry = 0; ; ) {
       if (steps > MOST_GROWTH * this.steps) throw new Error("the motion has become too fast to be computed");
       const courant = (yield [frameDt / steps, steps]) / dx;
-      if (courant <= Math.max(LIMIT, 1.25 * cfl) || this.head.substep !== null) return steps;
-      if (retry === RETRIES) {
-        if (courant <= 2) return steps;
-        throw new Error("the motion has become too fast to be computed");
+      const fits = this.fits(steps);
+      if (fits && (courant <= Math.max(LIMIT, 1.25 * cfl) || this.head.substep !== null)) return steps;
+      if (fits) {
+        if (retry++ === RETRIES) {
+          if (courant <= 2) return steps;
+          throw new Error("the motion has become too fast to be computed");
+        }
+        const growth = Number.isFinite(courant) ? courant / cfl : 4;
+        steps = Math.floor(steps * Math.min(growth * 1.1, 4)) + 1;
       }
-      const growth = Number.isFinite(courant) ? courant / cfl : 4;
-      steps = Math.floor(steps * Math.min(growth * 1.1, 4)) + 1;
       fields.set(this.before);
       [this.time, this.substep, this.wind.come] = [time, substep, [...come]];
     }
@@ -127,6 +133,7 @@ export class Solver extends Body {
     for (let k = 0; k < steps; k++) {
       if (k > 0 && k % every === 0) far();
       if (k % MOST === 0) this.write(dt, Math.min(MOST, steps - k));
+      if (k % this.interval === 0) this.list();
       this.tables.first[0] = k % MOST;
       this.tables.clock[0] = this.time;
       run();
@@ -163,6 +170,50 @@ export class Solver extends Body {
     tables.material.set(this.moduli.map((x) => x * this.stiffness), points);
     tables.curving?.set(this.curving.map((x) => x * Math.sqrt(this.stiffness)));
     this.blow(Array.from({ length: steps }, (_, k) => this.time + k * dt));
+  }
+
+  // ---- contact of the material with itself; see ContactRun in gaussian_swaying/mpm/contact.py
+
+  /** Makes lists for places that come closer by a margin [m], after each `interval` of substeps; never where nothing touches. */
+  trust(margin, interval = Infinity) {
+    this.margin = margin;
+    this.interval = interval;
+    this.tables.limit?.set([this.head.contact.gap + margin]);
+  }
+
+  /** Lists what may touch. */
+  list() {
+    const { kernels, tables } = this;
+    const { samples, low, hashes, cells, start, order, ordered, status } = tables;
+    if (!samples) return;
+    kernels.place();
+    low.fill(Infinity);
+    samples.forEach((x, i) => (low[i % 3] = Math.min(low[i % 3], x)));
+    status[0] = 0;
+    kernels.cell();
+    start.fill(0);
+    for (const hash of hashes) start[hash + 1]++;
+    for (let k = 1; k < start.length; k++) start[k] += start[k - 1];
+    const next = start.slice();
+    hashes.forEach((hash, p) => (order[next[hash]++] = p));
+    const many = order.length;
+    for (let plane = 0; plane < ordered.length; plane += many) order.forEach((p, k) => (ordered[plane + k] = cells[plane + p]));
+    kernels.list();
+  }
+
+  /** Whether the lists of the last substeps were complete; if not, the next ones will be. */
+  fits(steps) {
+    const { motion, status } = this.tables;
+    if (!motion) return true;
+    const { least, sure, longest, room, slots } = this.head.contact;
+    if (status[1] > room || status[2] > slots) throw new Error("too much of the material touches itself");
+    const { margin } = this;
+    const moved = motion[0];
+    motion[0] = 0;
+    if (!(moved < 1e9)) return true;
+    const step = sure * Math.max(moved / Math.min(steps, this.interval), 1e-9);
+    this.trust(Math.max(least, step), Math.min(longest, Math.floor(Math.max(least, step) / step)));
+    return moved <= margin;
   }
 
   // ---- what is seen
