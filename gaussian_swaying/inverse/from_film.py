@@ -161,11 +161,9 @@ def prepare(
     preview = suggest(splat, **wanted)
     shown, lines = _shown(seen, read_videos(folder / CAMERAS, origin=seen.cloud.origin)[0], preview, wanted)
     wanted |= shown
+    preview = suggest(splat, **wanted) if shown else preview
     if isinstance(length, tuple):
-        preview = suggest(splat, **wanted) if shown else preview
-        wanted["longest_side"] = longest_side(*length, seen, preview)
-    if shown or "longest_side" in wanted:
-        preview = suggest(splat, **wanted)
+        preview = suggest(splat, **wanted, longest_side=longest_side(*length, seen, preview))
     if length == "gravity" and not preview.falls:
         raise ValueError(
             "`--length gravity` is for a sheet alone, or for what nothing holds: anything else was captured in balance "
