@@ -178,7 +178,6 @@ class Course:
         rounds: How often it went on from another end.
         tried: Steps that the solve of the last step has tried.
         ended: The reason why it ended; empty if it did not.
-        history: One row for each step.
         seconds: Time spent.
     """
 
@@ -684,7 +683,6 @@ def run_fit(
 
     Args:
         plan: From :func:`~gaussian_swaying.inverse.plan.read_plan`.
-        output: The folder.
         resume: Continue the fit in it after its last step.
         device: ``auto``, ``cpu`` or ``cuda``.
         progress: Print a line for each step, and a bar.

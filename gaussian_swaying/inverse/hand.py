@@ -143,7 +143,6 @@ def follow_camera(
 
     Args:
         video: The film. Its cameras may be those of the first frame, or rough ones of all frames.
-        background: What stands still.
         tick: Called with 1 after each frame.
     """
     found: list[Registration | None] = []
@@ -199,7 +198,6 @@ def gains(video: Footage, background: Background) -> tuple[Tensor, tuple[int, ..
 
     Args:
         video: The film, with the camera of each frame.
-        background: What stands still.
 
     Returns:
         Gains of red, green and blue, float64, shape (F, 3), and the frames that show too little of the background,
@@ -253,7 +251,6 @@ class Judged:
 
     Attributes:
         camera: Name of the camera.
-        frames: Number of its frames.
         moved: Distance that the background goes in the film of a camera that is said to stand still [pixels].
         hand_held: Whether the camera of each frame was found.
         residual: Median distance of points of the background from where these cameras see them [pixels].
@@ -303,8 +300,6 @@ def prepared(
     """Find the camera of each frame of films from a hand, and take drifts of exposure and white balance off all films.
 
     Args:
-        simulation: The scene.
-        videos: The films.
         hand_held: Whether their cameras move otherwise than they are said to. None: those whose frames all have one
             camera, but whose background moves by more than half a pixel.
         also_moves: Names of parts of the splat that move in the films, though the simulation does not move them.

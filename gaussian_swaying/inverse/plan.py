@@ -32,7 +32,6 @@ class Plan:
     Args:
         base: Configuration files of ``sim``: the splat, the solver, and first values.
         videos: Folders with transforms.json.
-        unknowns: The unknowns.
         known: Options of ``sim`` that replace those of the base.
         until: Fit the frames up to this time [s], half of them if it is None; the rest is predicted.
         search: Number of simulations of the coarse search; 0 starts at ``start`` or in the middle of the ranges.

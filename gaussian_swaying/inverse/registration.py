@@ -54,7 +54,6 @@ class Registration:
     """The camera of a frame.
 
     Attributes:
-        camera: The camera.
         matches: Points that were matched at the end.
         agreeing: Those that agree on the camera.
         residual: Root mean square of their distances [pixels].
@@ -87,7 +86,6 @@ def register(
 
     Args:
         frame: The frame, dtype uint8, shape (H, W, 3), without lens distortion.
-        cloud: The splat.
         up: Direction in the splat that is up, shape (3,); guessed if it is None.
         fov: Vertical field of view [degrees]; found if it is None.
 
