@@ -29,9 +29,9 @@ class Live:
         high: Largest value.
         scale: ``log`` for sizes of any order of magnitude, else ``linear``.
         kind: ``number``, ``whole`` or ``vector`` (three numbers).
-        batched: Whether simulations that differ in it are steps of one rollout.
-        same_points: Whether all objects take it without other points, patches or contact.
-        differentiable: Whether it keeps the gradient of a tensor.
+        batched: Whether simulations with different values can run together in one rollout.
+        same_points: Whether it can change without remaking material points, patches or contact samples.
+        differentiable: Whether a tensor that requires a gradient keeps it.
     """
 
     unit: str = ""

@@ -127,7 +127,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> list[str]:
     if simulation.scene.loose and options.verbose:
         specks = f"{simulation.scene.loose:,} specks hang on nothing or by a thread"
         lines.append(f"  note: {specks}; they follow their nearest neighbours (scene.loose: carry)")
-    lines += [f"  {line}" for line in doubts(found, options)]
+    lines += [f"  {line}" for line in doubts(found)]
     lines += run_lines(simulation) + cost_lines(cost) if options.verbose else []
     film = f"{options.frames * FRAME_DT:.3g} s at {PICTURE[0]} x {PICTURE[1]}"
     where = Path("outputs") / splat_name(options.scene)
@@ -168,33 +168,20 @@ def _write_numbers(folder: Path, cost: Cost, **more: Any) -> None:
     (folder / "preview.json").write_text(text + "\n", encoding="utf-8")
 
 
-def doubts(found: Suggestion, options: argparse.Namespace) -> list[str]:
-    """Warnings about weak guesses, each with the command for the guess and the one for the next best."""
+def doubts(found: Suggestion) -> list[str]:
+    """Warnings about weak guesses, each with the option that replaces it."""
     lines: list[str] = []
     count, box = int(found.moving.simulated.sum()), found.moving.box
     if found.moving.confidence == "low" and box is not None:
-        lines.append(f"warning: that these {count:,} Gaussians are the object is a weak guess; check the picture:")
-        lines.append(f"  {preview_command(options, region=[*box[0], *box[1]])}   # as guessed: give another box")
+        corners = " ".join(f"{value:g}" for corner in box for value in corner)
+        what = f"that these {count:,} Gaussians are the object is a weak guess"
+        lines.append(f"warning: {what}: check the picture, or give another box than --region {corners}")
     held = f"that it is held at the {found.hold.name} is"
     for name, what, guess in (("up", "the up axis is", found.up), ("hold", held, found.hold)):
         if guess.confidence == "low":
-            lines.append(f"warning: {what} a weak guess; check the picture, and set it:")
-            for value, words in zip(guess.options, ("as guessed", "the next best"), strict=False):
-                if options.verbose or words != "as guessed":
-                    lines.append(f"  {preview_command(options, **{name: value.split()})}   # {words}")
+            other = "".join(f"; the next best is --{name} {value}" for value in guess.options[1:])
+            lines.append(f"warning: {what} a weak guess: check the picture{other}")
     return lines
-
-
-def preview_command(options: argparse.Namespace, **changes: Sequence[Any]) -> str:
-    """The command line of the preview with these options, some of them changed."""
-    words, defaults = ["preview", options.scene], vars(build_options().parse_args([]))
-    for name, default in defaults.items():
-        value = changes.get(name, getattr(options, name, default))
-        if name == "scene" or value is None or value == default:
-            continue
-        listed = value if isinstance(value, list | tuple) else [] if value is True else [value]
-        words += ["--" + name.replace("_", "-"), *(f"{v:g}" if isinstance(v, float) else str(v) for v in listed)]
-    return program.command(*words)
 
 
 def splat_name(path: str | Path) -> str:

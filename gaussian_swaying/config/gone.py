@@ -40,6 +40,10 @@ GONE = {
     "EllipsoidObstacle": "Obstacle",
     "BallObstacle": "Obstacle with `shape: Sphere`",
     "fit.wind_changes": "`until`, for a part of the film in which the wind is steady",
+    "fit.stages": "nothing, as points are always followed and then matched",
+    "fit.fit_share": "`until`, a time [s]",
+    "fit.starts": "nothing: three starts go on",
+    "fit.seed": "nothing: the search is always the same",
     "FlagOnStandScene": "FlagScene with `stand: pole`",
 }
 """What to use in place of classes, fields of classes (``Class.field``) and other fields (``scene.field``)."""

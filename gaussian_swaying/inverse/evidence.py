@@ -1,17 +1,14 @@
-"""Evidence of a fit: what films show, and how far variants are from it."""
+"""Evidence of a fit: points that are followed in films, and how far variants are from them."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.inverse.least_squares import Block
 from gaussian_swaying.inverse.tracks import Tracks
 from gaussian_swaying.inverse.unknowns import FILM_START, Values
@@ -19,7 +16,6 @@ from gaussian_swaying.inverse.variants import states_of
 from gaussian_swaying.inverse.videos import Footage
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.rendering.cameras.camera import Camera, project
-from gaussian_swaying.simulation.draw import Painter
 from gaussian_swaying.simulation.measure import SimulationDiverged
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -27,8 +23,8 @@ LEAST_FACING = 0.05
 """Least weight of the residuals of a point that is seen edge-on."""
 
 MOMENTS, PATCHES = 4, 4
-"""Parts of the time, and squares along each side of the grid over tracks and pixels, which sort residuals into clusters
-of correlated errors."""
+"""Parts of the time, and squares along each side of the grid over tracks, which sort residuals into clusters of
+correlated errors."""
 
 NOISE = 0.5
 """Distance of a track that its own error explains [pixels]."""
@@ -36,133 +32,54 @@ NOISE = 0.5
 HELD, LEAST_HELD = 7, 6
 """One of so many tracks is not fitted, if there are at least so many of them."""
 
-Parts = dict[str, list[tuple[Tensor, Tensor, Tensor]]]
-"""Residuals of each kind, with their clusters and moments, frame by frame."""
-
 Tick = Callable[[int], object]
 """Called with the number of variants that reached one more frame."""
 
 
-class Evidence(ABC):
-    """One kind of difference between simulation and video, in one camera.
+class Evidence:
+    """What one camera shows: positions of Gaussians in the simulation are compared with those followed in its video.
 
-    Attributes:
-        kind: Its name.
-        floor: Lower bound of the standard deviation of the residuals.
-    """
-
-    kind: str
-    floor: float
-
-    def __init__(self, video: Footage) -> None:
-        self.video = video
-
-    @abstractmethod
-    def shown(self, simulation: Simulation, states: Sequence[State]) -> Any:
-        """The part of the residuals that is the same for all frames."""
-
-    @abstractmethod
-    def beside(self, shown: Any, frame: int) -> tuple[Tensor, Tensor]:
-        """Differences between a frame and what some states show, shape (B, R, D), and their clusters, shape (R,)."""
-
-
-class TrackEvidence(Evidence):
-    """Residuals of tracks: positions of Gaussians in the simulation minus those tracked in the video [pixels].
+    A camera that sees a surface edge-on hardly tells where its points are: residuals are multiplied by :func:`facing`.
 
     Args:
         simulation: The simulation.
         video: The video.
         tracks: Its tracks.
-        weighed: Multiply each residual by :func:`facing`, as a camera that sees a surface edge-on hardly tells where
-            its points are.
         trust: What else each residual is multiplied by, shape (F, T); None for 1.
 
     Attributes:
         rest: Places of the Gaussians at rest [scene units], on the CPU, shape (T, 3).
     """
 
-    kind, floor = "tracks", 0.05
-
-    def __init__(
-        self, simulation: Simulation, video: Footage, tracks: Tracks, weighed: bool = False, trust: Tensor | None = None
-    ) -> None:
-        super().__init__(video)
+    def __init__(self, simulation: Simulation, video: Footage, tracks: Tracks, trust: Tensor | None = None) -> None:
         scene = simulation.scene
-        self.tracks, self._weighed, self.trust = tracks, weighed, trust
+        self.video, self.tracks, self.trust, self._frame = video, tracks, trust, scene.frame
         index = tracks.index.to(scene.moving.device)
         self._follow = scene.follow.some(index).to(scene.moving.device)
         self._means = scene.model.means.detach()[scene.moving[index]]
         self.rest = self._means.cpu()
         self._cluster = _patch_of(self.rest)
-        self._weight = torch.ones(len(index), 1, dtype=torch.float64)
-        if weighed:
-            normals = scene.rest().normals[scene.moving[index]].cpu()
-            self._weight = facing(normals, self.rest, video.cameras[0])[:, None]
+        self._weight = facing(scene.rest().normals[scene.moving[index]].cpu(), self.rest, video.cameras[0])[:, None]
 
-    def on(self, simulation: Simulation) -> TrackEvidence:
+    def on(self, simulation: Simulation) -> Evidence:
         """The same tracks for the same scene on another grid."""
-        return TrackEvidence(simulation, self.video, self.tracks, self._weighed, self.trust)
+        return Evidence(simulation, self.video, self.tracks, self.trust)
 
-    def trusting(self, trust: Tensor) -> TrackEvidence:
-        """The same tracks, with residuals multiplied by ``trust``, shape (F, T)."""
-        found = copy(self)
-        found.trust = trust
-        return found
-
-    def shown(self, simulation: Simulation, states: Sequence[State]) -> Tensor:
+    def shown(self, states: Sequence[State]) -> Tensor:
         """Places of the Gaussians [scene units], shape (B, T, 3)."""
         moves = torch.stack([self._follow.motion(state)[0] for state in states]).to(self._means)
-        return (self._means + simulation.scene.frame.displacement_to_scene(moves)).cpu()
+        return (self._means + self._frame.displacement_to_scene(moves)).cpu()
 
     def pixels(self, shown: Tensor, frame: int) -> Tensor:
         """Where a frame would have them [pixels], shape (B, T, 2)."""
         return project(shown.flatten(0, 1), self.video.cameras[frame])[0].unflatten(0, shown.shape[:2])
 
     def beside(self, shown: Tensor, frame: int) -> tuple[Tensor, Tensor]:
-        """See the base class; D is 2."""
+        """Residuals of some states in a frame [pixels], shape (B, R, 2), and their clusters, shape (R,)."""
         seen = self.tracks.seen[frame]
-        pixel = self.pixels(shown[:, seen], frame)
         weight = self._weight[seen] if self.trust is None else self._weight[seen] * self.trust[frame, seen, None]
-        return weight * (pixel - self.tracks.position[frame, seen]), self._cluster[seen]
-
-
-class PictureEvidence(Evidence):
-    """Pictures of the simulation against frames, or their opacities against silhouettes, averaged over squares.
-
-    Args:
-        video: The video.
-        masks: Compare silhouettes instead of colours.
-        width: Width of the averaged pictures [pixels].
-    """
-
-    floor = 1 / 255
-
-    def __init__(self, video: Footage, masks: bool, width: int = 80) -> None:
-        super().__init__(video)
-        self.kind, self.masks = "silhouettes" if masks else "pixels", masks
-        self.factor = max(1, round(video.size[0] / width))
-
-    def shown(self, simulation: Simulation, states: Sequence[State]) -> tuple[Painter, list[DeformedGaussians]]:
-        return simulation.painter, [simulation.painter.deformed(state) for state in states]
-
-    def beside(self, shown: tuple[Painter, list[DeformedGaussians]], frame: int) -> tuple[Tensor, Tensor]:
-        """See the base class; D is 1 for silhouettes and 3 for colours."""
-        painter, several = shown
-        camera = self.video.cameras[frame].to(painter.device)
-        masks = self.video.masks
-        wanted = self.video.images[frame] if masks is None or not self.masks else masks[frame][..., None]
-        target = self._averaged(wanted.to(painter.device).float() / 255)
-        found = []
-        for gaussians in several:
-            picture = painter.picture(gaussians, camera)
-            seen = picture.alpha if self.masks else picture.color
-            found.append((self._averaged(seen.float()) - target).flatten(0, 1))
-        row, column = (torch.arange(n) * PATCHES // n for n in target.shape[:2])
-        return torch.stack(found).double().cpu(), (row[:, None] * PATCHES + column).reshape(-1)
-
-    def _averaged(self, picture: Tensor) -> Tensor:
-        planes = picture.permute(2, 0, 1)[None]
-        return torch.nn.functional.avg_pool2d(planes, self.factor)[0].permute(1, 2, 0)
+        off = self.pixels(shown[:, seen], frame) - self.tracks.position[frame, seen]
+        return weight * off, self._cluster[seen]
 
 
 def compare(
@@ -173,8 +90,8 @@ def compare(
     careful: bool = True,
     moving: bool = False,
     tick: Tick = lambda count: None,
-) -> list[Block]:
-    """Simulate variants and compare each with the videos.
+) -> Block:
+    """Simulate variants, and compare each with the videos.
 
     Args:
         simulation: The base.
@@ -187,27 +104,13 @@ def compare(
         tick: Called after every frame.
 
     Returns:
-        One block for each kind, joined over cameras and times; clusters of different kinds and, for pictures, cameras
-        differ.
+        Residuals of all cameras and times.
     """
-    parts: Parts = {}
+    wanted = [(time, [(0, time)] if time > 0 or moving else []) for time in times]  # at rest all variants are alike
     try:
-        runs = states_of(simulation, values, times, alike=careful)
-        for number, (time, states) in enumerate(zip(times, runs, strict=True)):
-            tick(len(values))
-            if time <= 0 and not moving:  # at rest all variants are alike
-                continue
-            for place, part in enumerate(evidence):
-                if (frame := part.video.frame_at(time)) is not None:
-                    found, cluster = part.beside(part.shown(simulation, states), frame)
-                    shift = 0 if part.kind == "tracks" else place * PATCHES**2
-                    moment = torch.full_like(cluster, number * MOMENTS // len(times))
-                    parts.setdefault(part.kind, []).append((found, cluster + shift, moment))
+        return _compared(simulation, evidence, values, wanted, 1, careful, tick)[0]
     except SimulationDiverged:
-        if not careful:
-            raise
-        return compare(simulation, evidence, values, times, False, moving, tick)
-    return _joined(parts)
+        return _compared(simulation, evidence, values, wanted, 1, False, tick)[0]
 
 
 def compare_starts(
@@ -217,37 +120,46 @@ def compare_starts(
     times: Sequence[float],
     starts: Sequence[float],
     tick: Tick = lambda count: None,
-) -> list[list[Block]]:
+) -> list[Block]:
     """Compare variants as if each had begun to move at each of some times of the film, from one simulation of each.
 
     The arguments are those of :func:`compare`, in a wind that does not depend on time, and times at which the motion
-    begins [s]. For each of these, the blocks of all variants, also of the first frame; NaN for one that diverged.
+    begins [s]. For each of these, the residuals of all variants, also of the first frame; NaN for one that diverged.
     """
     wanted: dict[int, list[tuple[int, float]]] = {}  # what is compared with a state, by its time [microseconds]
     for number, start in enumerate(starts):
         for time in times:
             wanted.setdefault(round(1e6 * max(0.0, time - start)), []).append((number, time))
-    moments = sorted(wanted)
     own = [{name: value for name, value in one.items() if name != FILM_START} for one in values]
-    parts: list[Parts] = [{} for _ in starts]
-    runs = states_of(simulation, own, [1e-6 * moment for moment in moments], alike=False)
-    for moment, states in zip(moments, runs, strict=True):
+    pairs = [(1e-6 * moment, what) for moment, what in sorted(wanted.items())]
+    return _compared(simulation, evidence, own, pairs, len(starts), False, tick)
+
+
+def _compared(
+    simulation: Simulation,
+    evidence: Sequence[Evidence],
+    values: Sequence[Values],
+    wanted: Sequence[tuple[float, Sequence[tuple[int, float]]]],
+    count: int,
+    careful: bool,
+    tick: Tick,
+) -> list[Block]:
+    """Blocks of residuals: the state at each time is compared for blocks of some numbers with frames at some times."""
+    parts: list[list[tuple[Tensor, Tensor, Tensor]]] = [[] for _ in range(count)]
+    runs = states_of(simulation, values, [moment for moment, _ in wanted], alike=careful)
+    for number, ((_, what), states) in enumerate(zip(wanted, runs, strict=True)):
         tick(len(values))
-        for part in evidence:
-            shown = part.shown(simulation, states)
-            for number, time in wanted[moment]:
+        for part in evidence if what else ():
+            shown = part.shown(states)
+            for block, time in what:
                 if (frame := part.video.frame_at(time)) is not None:
                     found, cluster = part.beside(shown, frame)
-                    parts[number].setdefault(part.kind, []).append((found, cluster, torch.zeros_like(cluster)))
-    return [_joined(own) for own in parts]
-
-
-def _joined(parts: Parts) -> list[Block]:
-    found = []
-    for kind, own in parts.items():
-        values, cluster, moment = zip(*own, strict=True)
-        found.append(Block(kind, torch.cat(values, 1), torch.cat(cluster), torch.cat(moment)))
-    return found
+                    parts[block].append((found, cluster, torch.full_like(cluster, number * MOMENTS // len(wanted))))
+    blocks = []
+    for own in parts:
+        residuals, clusters, moments = zip(*own, strict=True)
+        blocks.append(Block(torch.cat(residuals, 1), torch.cat(clusters), torch.cat(moments)))
+    return blocks
 
 
 def facing(normals: Tensor, points: Tensor, camera: Camera) -> Tensor:
@@ -268,28 +180,24 @@ def _patch_of(points: Tensor) -> Tensor:
     return cell[:, 0] * PATCHES + cell[:, 1]
 
 
-class Followed:
-    """The share of the motion of tracks that were not fitted which a simulation explains, added up frame by frame."""
-
-    def __init__(self, simulation: Simulation, videos: Sequence[Footage], tracks: Sequence[Tracks]) -> None:
-        self._simulation = simulation
-        pairs = zip(videos, tracks, strict=True)
-        self._own = {video.name: TrackEvidence(simulation, video, held_out(own)) for video, own in pairs}
-        self._left, self._moved = dict.fromkeys(self._own, 0.0), dict.fromkeys(self._own, 0.0)
-
-    def add(self, moment: float, state: State) -> None:
-        """Add the state at a time of the film [s]."""
-        for name, own in self._own.items():
-            if (frame := own.video.frame_at(moment)) is not None:
-                seen = own.tracks.seen[frame]
-                rest = project(own.rest[seen], own.video.cameras[frame])[0]
-                off = own.beside(own.shown(self._simulation, [state]), frame)[0].square().sum(-1)
-                self._left[name] += float((off - NOISE**2).clamp(min=0).sum())
-                self._moved[name] += float((own.tracks.position[frame, seen] - rest).square().sum())
-
-    def shares(self) -> dict[str, float]:
-        """The share of each camera in which something moves."""
-        return {name: 1 - self._left[name] / moved for name, moved in self._moved.items() if moved > 0}
+def explained(
+    simulation: Simulation,
+    videos: Sequence[Footage],
+    tracks: Sequence[Tracks],
+    values: Values,
+    times: Sequence[float],
+) -> dict[str, float]:
+    """The share of the motion of tracks that were not fitted which a simulation explains, by camera."""
+    parts = [Evidence(simulation, video, held_out(own)) for video, own in zip(videos, tracks, strict=True)]
+    left, moved = dict.fromkeys((video.name for video in videos), 0.0), dict.fromkeys((v.name for v in videos), 0.0)
+    for number, frame, pixel in _pixels(simulation, parts, values, times):
+        part = parts[number]
+        seen = part.tracks.seen[frame]
+        there, name = part.tracks.position[frame, seen], part.video.name
+        off = (pixel[seen] - there).square().sum(-1) - NOISE**2
+        left[name] += float(off.clamp(min=0).sum())
+        moved[name] += float((there - project(part.rest[seen], part.video.cameras[frame])[0]).square().sum())
+    return {name: 1 - left[name] / all_of_it for name, all_of_it in moved.items() if all_of_it > 0}
 
 
 def _held(tracks: Tracks) -> Tensor:
@@ -322,18 +230,20 @@ def trusted(
     values to where they make up for the grid. A residual is multiplied by :math:`(1 + d^2 / n^2)^{-1/2}`, with the root
     mean square distance d of the point in a frame of the other grids from that of its own, and the error n of a track.
     """
-    parts = [part for part in evidence if isinstance(part, TrackEvidence)]
-    if not others or not parts:
+    if not others:
         return list(evidence)
-    own = _pixels(simulation, parts, values, times)
-    trust = [torch.ones(part.tracks.seen.shape, dtype=torch.float64) for part in parts]
+    own = {(number, frame): pixel for number, frame, pixel in _pixels(simulation, evidence, values, times)}
     squares = {key: torch.zeros(len(pixel), dtype=torch.float64) for key, pixel in own.items()}
     for other in others:
-        for key, pixel in _pixels(other, [part.on(other) for part in parts], values, times).items():
-            squares[key] += torch.nan_to_num(pixel - own[key]).square().sum(-1) / (2 * len(others))  # NaN: it diverged
+        for number, frame, pixel in _pixels(other, [part.on(other) for part in evidence], values, times):
+            off = torch.nan_to_num(pixel - own[number, frame])  # NaN: it diverged
+            squares[number, frame] += off.square().sum(-1) / (2 * len(others))
+    found = [copy(part) for part in evidence]
+    for part in found:
+        part.trust = torch.ones(part.tracks.seen.shape, dtype=torch.float64)
     for (number, frame), square in squares.items():
-        trust[number][frame] = (1 + square / NOISE**2).rsqrt()
-    return [part.trusting(trust[parts.index(part)]) if isinstance(part, TrackEvidence) else part for part in evidence]
+        found[number].trust[frame] = (1 + square / NOISE**2).rsqrt()  # type: ignore[index]
+    return found
 
 
 def distrust(evidence: Sequence[Evidence], times: Sequence[float]) -> float:
@@ -344,19 +254,17 @@ def distrust(evidence: Sequence[Evidence], times: Sequence[float]) -> float:
     """
     found = []
     for part in evidence:
-        if isinstance(part, TrackEvidence) and part.trust is not None:
+        if part.trust is not None:
             frames = [frame for time in times if (frame := part.video.frame_at(time)) is not None]
             found.append(-2 * part.trust[frames][part.tracks.seen[frames]].log())
     return float(torch.cat(found).mean()) if found else 0.0
 
 
 def _pixels(
-    simulation: Simulation, parts: Sequence[TrackEvidence], values: Values, times: Sequence[float]
-) -> dict[tuple[int, int], Tensor]:
-    """Places of the points of each part in each frame [pixels], shape (T, 2)."""
-    found = {}
+    simulation: Simulation, parts: Sequence[Evidence], values: Values, times: Sequence[float]
+) -> Iterator[tuple[int, int, Tensor]]:
+    """Number of the part, number of the frame, and where it would have the part's points [pixels], shape (T, 2)."""
     for time, states in zip(times, states_of(simulation, [values], times, alike=False), strict=True):
         for number, part in enumerate(parts):
             if (frame := part.video.frame_at(time)) is not None:
-                found[number, frame] = part.pixels(part.shown(simulation, states), frame)[0]
-    return found
+                yield number, frame, part.pixels(part.shown(states), frame)[0]

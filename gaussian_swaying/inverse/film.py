@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import subprocess
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +18,7 @@ from gaussian_swaying._inputs import check_regular
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.grouping import connected_parts
 from gaussian_swaying.geometry.neighbours import particle_spacing
-from gaussian_swaying.inverse.registration import LEAST, SOLID, in_space, off_camera
+from gaussian_swaying.inverse.registration import SOLID, in_space, off_camera
 from gaussian_swaying.inverse.tracks import follow, opencv
 from gaussian_swaying.inverse.videos import Footage, check_wide, frames_of, next_of, scaled
 from gaussian_swaying.rendering.cameras.camera import Camera
@@ -37,10 +37,11 @@ FULL = 0.6
 """Share of the picture that a splat covers which has surroundings: then most of its points stand still."""
 
 STRAY, IN_A_ROW = 1.5, 3
-"""Distance of a point that moves from where the camera sees it at rest [pixels], and frames in which some do."""
+"""Distance of a point that moves from where it was at rest [pixels], and frames in which some do, where most of the
+picture stands still."""
 
 LEAST_SHAKEN = 8
-"""Fewest points of the background that tell how a hand shakes."""
+"""Fewest points that tell how a hand shakes."""
 
 END, FLAT, FEWEST = 0.12, 0.3, 5
 """Part of an object that is one of its ends, as a share of its length in that direction; least length in a direction
@@ -124,34 +125,97 @@ def view_of_focal(millimetres: float, width: int, height: int) -> float:
     return 2 * math.degrees(math.atan(0.5 * height * DIAGONAL / (millimetres * math.hypot(width, height))))
 
 
+class Points:
+    """Points of a splat in the first frame of a film, at rest, and points around it, which tell how a hand shakes.
+
+    Args:
+        grey: The first frame, dtype uint8, NumPy array (H, W).
+        picture: The splat, drawn from the camera of the first frame, perhaps larger.
+        camera: That camera.
+
+    Attributes:
+        start: All of them, of the splat first [pixels], shape (T, 2).
+        full: Whether the splat covers most of the picture. Then most of its points stand still, and tell it.
+    """
+
+    def __init__(self, grey: Any, picture: RenderOutput, camera: Camera) -> None:
+        import numpy as np
+
+        cv2, scale = opencv(), camera.width / grey.shape[1]
+        alpha = picture.alpha[..., 0].detach().cpu().numpy()
+        cover = (cv2.resize(alpha, grey.shape[::-1], interpolation=cv2.INTER_AREA) > SOLID).astype(np.uint8)
+        around = (cv2.dilate(cover, np.ones((15, 15), np.uint8)) == 0).astype(np.uint8)
+        corners = [cv2.goodFeaturesToTrack(grey, 600, 0.01, 4, mask=mask) for mask in (cover, around)]
+        own, beside = (np.zeros((0, 2)) if one is None else one.reshape(-1, 2) + 0.5 for one in corners)
+        self.start, self._count = np.concatenate([own, beside]), len(own)
+        self.full = len(beside) < LEAST_SHAKEN and cover.mean() > FULL
+        self.world, self.known = in_space(picture, camera, own * scale)
+        self._lens = camera.intrinsics.double().numpy() / np.array([[scale], [scale], [1.0]])
+
+    def far(self, place: Any, seen: Any, near: float) -> Any:
+        """How far points of the splat that are found in a frame, of all (T, 2), have gone [pixels]; NaN if not known.
+
+        Where most of the picture stands still, points agree on a camera that are nearer than ``near``.
+        """
+        import numpy as np
+
+        found, used = np.full(self._count, np.nan), seen[: self._count] & self.known
+        there = place[: self._count][used]
+        if self.full:
+            off = off_camera(self.world[used], there, self._lens, near)
+            found[used] = np.nan if off is None else off
+        else:
+            turn = self.shake(place, seen)
+            found[used] = np.linalg.norm(there - self.start[: self._count][used] @ turn[:, :2].T - turn[:, 2], axis=-1)
+        return found
+
+    def shake(self, place: Any, seen: Any) -> Any:
+        """The motion of the picture from the first frame to another, as points around the splat tell it, (2, 3)."""
+        import numpy as np
+
+        around, turn = seen.copy(), None
+        around[: self._count] = False
+        if around.sum() >= LEAST_SHAKEN:
+            turn = opencv().estimateAffinePartial2D(self.start[around], place[around], ransacReprojThreshold=1.5)[0]
+        return np.eye(2, 3) if turn is None else turn
+
+
 def begins_to_move(film: Film, picture: RenderOutput, camera: Camera) -> float | None:
     """Time of the first frame in which the object is not as in the first one [s]; None if there is none.
 
-    A hand that shakes moves the background, too, and does not count: what lies around the splat, or most of a splat
-    that fills the picture.
+    A hand that shakes moves the background, too, and does not count.
 
     Args:
-        film: The film; the object is at rest in its first frame. Brighter and darker frames do not count as motion.
+        film: The film; the object is at rest in its first frame.
         picture: The splat, drawn from the camera of the first frame.
         camera: That camera.
     """
     import numpy as np
 
+    cv2: Any = opencv()
     factor = max(1.0, max(film.width, film.height) / SMALL)
     size = round(film.width / factor), round(film.height / factor)
-    first: Any = None
     with closing(frames_of(film.path, outputs=scaled(*size), grey=True)) as frames:
-        width, height = next_of(frames, film.path)["size"]
-        where = picture.alpha[..., 0].detach().cpu().float()[None, None]
-        mask = torch.nn.functional.interpolate(where, size=(height, width), mode="area")[0, 0] > 0.3
-        inside = (mask if bool(mask.any()) else torch.ones_like(mask)).numpy()
-        number, in_a_row, full = 0, 0, inside.mean() > FULL
+        shape = next_of(frames, film.path)["size"][::-1]
+        first = np.frombuffer(next_of(frames, film.path), dtype=np.uint8).reshape(shape)
+        cover = (
+            cv2.resize(picture.alpha[..., 0].detach().cpu().numpy(), shape[::-1], interpolation=cv2.INTER_AREA) > 0.3
+        )
+        inside = cover if cover.any() else ~cover
+        points, number, in_a_row = Points(first, picture, camera), 1, 0
         while (frame := next_of(frames, film.path)) is not None:
-            grey = np.frombuffer(frame, dtype=np.uint8).reshape(height, width)
-            if first is None:
-                first, steady = grey, _in_a_room(grey, picture, camera) if full else _steady(grey, inside)
-            in_a_row = in_a_row + 1 if _differs(first, grey, inside) and steady(grey) else 0
-            if in_a_row == (IN_A_ROW if full else 1):
+            grey = np.frombuffer(frame, dtype=np.uint8).reshape(shape)
+            moved = _differs(first, grey, inside)
+            if moved:
+                (_, place), (_, seen) = follow(np.stack([first, grey]), points.start)
+                if points.full:
+                    far = points.far(place, seen, STRAY)
+                    moved = (far > STRAY).sum() >= max(LEAST_SHAKEN, MOVED_SHARE * np.isfinite(far).sum())
+                else:
+                    how = {"flags": cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
+                    moved = _differs(first, cv2.warpAffine(grey, points.shake(place, seen), shape[::-1], **how), inside)
+            in_a_row = in_a_row + 1 if moved else 0
+            if in_a_row == (IN_A_ROW if points.full else 1):
                 return (number + 1 - in_a_row) / film.fps
             number += 1
     return None
@@ -162,50 +226,6 @@ def _differs(first: Any, grey: Any, where: Any) -> bool:
     before, now = (picture[where].astype(float) for picture in (first, grey))
     level = now * (before.mean() / max(now.mean(), 1.0))
     return bool((abs(level - before) > DIFFERENT).mean() > MOVED_SHARE)
-
-
-def _steady(first: Any, inside: Any) -> Callable[[Any], bool]:
-    """Tells whether the object is not as in the first frame once the shake of a hand is off, by the background."""
-    import numpy as np
-
-    cv2 = opencv()
-    around = 255 * (cv2.dilate(inside.astype(np.uint8), np.ones((15, 15), np.uint8)) == 0).astype(np.uint8)
-    points = cv2.goodFeaturesToTrack(first, 200, 0.05, 5, mask=around)
-
-    def aligned(grey: Any) -> Any:
-        """A frame, moved and turned onto the first one; as it is if the background has too few points."""
-        if points is None or len(points) < LEAST_SHAKEN:
-            return grey
-        there, found, _ = cv2.calcOpticalFlowPyrLK(first, grey, points, None)
-        kept = found[:, 0] > 0
-        if kept.sum() < LEAST_SHAKEN:
-            return grey
-        turn, _ = cv2.estimateAffinePartial2D(there[kept], points[kept])
-        return grey if turn is None else cv2.warpAffine(grey, turn, grey.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
-
-    return lambda grey: _differs(first, aligned(grey), inside)
-
-
-def _in_a_room(first: Any, picture: RenderOutput, camera: Camera) -> Callable[[Any], bool]:
-    """Tells whether points are not where a camera sees those that stand still, most of a splat that fills the picture.
-
-    The picture is from the camera, which may be larger than the first frame.
-    """
-    import numpy as np
-
-    scale = np.array([camera.width / first.shape[1], camera.height / first.shape[0]])
-    corners = opencv().goodFeaturesToTrack(first, 500, 0.01, 4)
-    start = np.zeros((0, 2)) if corners is None else corners.reshape(-1, 2) + 0.5
-    world, known = in_space(picture, camera, start * scale)
-    intrinsics = camera.intrinsics.double().numpy() / np.array([[scale[0]], [scale[1]], [1.0]])
-
-    def differs(grey: Any) -> bool:
-        (_, there), (_, seen) = follow(np.stack([first, grey])[..., None].repeat(3, -1), start)
-        used = seen & known
-        off = off_camera(world[used], there[used], intrinsics, STRAY)
-        return off is not None and bool((off > STRAY).sum() >= max(LEAST_SHAKEN, MOVED_SHARE * len(off)))
-
-    return differs
 
 
 @dataclass(frozen=True)
@@ -296,30 +316,11 @@ def moving_points(video: Footage, picture: RenderOutput) -> tuple[Tensor, Tensor
     """
     import numpy as np
 
-    cv2: Any = opencv()
-    grey = cv2.cvtColor(video.images[0].numpy(), cv2.COLOR_RGB2GRAY)
-    cover = (picture.alpha[..., 0].detach().cpu().numpy() > SOLID).astype(np.uint8)
-    around = (cv2.dilate(cover, np.ones((31, 31), np.uint8)) == 0).astype(np.uint8)
-    corners = [cv2.goodFeaturesToTrack(grey, 600, 0.01, 5, mask=mask) for mask in (cover, around)]
-    there, beside = (np.zeros((0, 2)) if one is None else one.reshape(-1, 2) + 0.5 for one in corners)
-    position, seen = follow(video.images.numpy(), np.concatenate([there, beside]))
-    world, known = in_space(picture, video.cameras[0], there)
-    outside = position[:, len(there) :], seen[:, len(there) :]
-    position, seen = position[:, : len(there)], seen[:, : len(there)]
-    gone = np.zeros(len(there))
-    K = video.cameras[0].intrinsics.double().numpy()
-    for k in range(1, len(position)):
-        used = known & seen[k]
-        if len(beside) < LEAST and cover.mean() > FULL:
-            far = off_camera(world[used], position[k, used], K, LEAST_MOTION)
-        else:
-            start = position[0]
-            if len(beside) >= LEAST:  # what lies around the splat
-                moved, valid = outside[0][k], outside[1][k]
-                turn = cv2.estimateAffinePartial2D(outside[0][0][valid], moved[valid], ransacReprojThreshold=1.5)[0]
-                start = start if turn is None else start @ turn[:, :2].T + turn[:, 2]
-            far = np.linalg.norm(position[k] - start, axis=-1)[used]
-        if far is not None:
-            gone[used] = np.maximum(gone[used], far)
-    kept = known & (seen.mean(0) > 0.5)
-    return torch.from_numpy(world[kept]), torch.from_numpy(gone[kept])
+    cv2, images = opencv(), video.images.numpy()
+    points = Points(cv2.cvtColor(images[0], cv2.COLOR_RGB2GRAY), picture, video.cameras[0])
+    position, seen = follow(images, points.start)
+    gone, own = np.zeros(len(points.world)), seen[:, : len(points.world)]
+    for place, valid in zip(position[1:], seen[1:], strict=True):
+        gone = np.fmax(gone, points.far(place, valid, LEAST_MOTION))
+    kept = points.known & (own.mean(0) > 0.5)
+    return torch.from_numpy(points.world[kept]), torch.from_numpy(gone[kept])

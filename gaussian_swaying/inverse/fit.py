@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from copy import copy
 from dataclasses import dataclass, field, replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +21,12 @@ from tqdm import tqdm
 
 from gaussian_swaying._files import write_json
 from gaussian_swaying._inputs import read_json
-from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.inverse.evidence import (
     Evidence,
-    Followed,
-    PictureEvidence,
-    TrackEvidence,
     compare,
     compare_starts,
     distrust,
+    explained,
     fitted_part,
     trusted,
 )
@@ -45,7 +41,6 @@ from gaussian_swaying.inverse.least_squares import (
     cost_of,
     expected_gain,
     linearised,
-    scales_of,
     solve,
     step_from,
 )
@@ -65,7 +60,6 @@ from gaussian_swaying.inverse.rivals import bent_alike, is_mirrored, rivals_of
 from gaussian_swaying.inverse.tracks import Tracks, beside_rest, match, opencv, still_until, track
 from gaussian_swaying.inverse.unknowns import (
     FILM_START,
-    Direction,
     Unknown,
     apart_by,
     changes,
@@ -89,22 +83,34 @@ FAR, GAIN = 0.005, 0.003
 """Step, as a share of a range, and least expected relative decrease of the cost by it, above which the values have not
 settled."""
 
-HORIZONS = (0.25, 0.5)
-"""Shares of the fitted frames that the first stage takes, one after the other, and all frames if no matches follow.
+STEPS = (
+    ("tracks", 0.25),
+    ("tracks", 0.5),
+    ("matches", 0.5),
+    ("matches", 0.5),
+    ("matches", 0.75),
+    ("matches", 1.0),
+    ("matches", 1.0),
+)
+"""What is compared in each step, and the share of the fitted frames that it takes: Gaussians that were followed from
+frame to frame, then those that are matched from rendered frames to frames of the video.
 
 Chaos grows with time: in a flapping flag, a change of Young's modulus by a hundredth makes pixels of difference
 within two seconds, and over the whole video the cost has local minima far from the global one. So the first horizon is
 the shortest time that determines the unknowns, and its solution must be exact before time is added."""
 
-MATCHED = (0.5, 0.5, 0.75, 1.0, 1.0)
-"""Shares of the fitted frames that are used, one for each time that Gaussians are matched again."""
+TRUSTED = 0.5
+"""Share of the fitted frames from which other grids tell which points to trust."""
+
+STARTS = 3
+"""Starts that the search gives to short solves."""
 
 SEARCHED, NEAR = 0.5, 0.1
 """Share of the fitted frames that the coarse search looks at, and standard deviation of its second part, as a share of
 the ranges."""
 
-COARSE = {"tracks": 0.02, "matches": 0.02, "silhouettes": 0.1, "pixels": 0.1}
-"""Standard deviations of residuals in the coarse search: shares of the picture's width, and grey levels."""
+COARSE = 0.02
+"""Standard deviation of residuals in the coarse search, per the width of a picture."""
 
 LONG_STILL = 0.05
 """Longest time that a film may be still, if the start of its motion is no unknown [s]."""
@@ -163,7 +169,7 @@ class Course:
     """The resume state of a fit, as ``fit.json`` stores it.
 
     Attributes:
-        step: Number of the step, which is a stage at a horizon; -1 before the end of the search.
+        step: Number of the step, of :data:`STEPS`; -1 before the end of the search.
         starts: Places that the search found, as shares of their ranges.
         place: Values of the unknowns, as shares of their ranges.
         first: Values (as shares) whose simulation the first frame looks like; empty if it shows the scene at rest.
@@ -173,7 +179,6 @@ class Course:
         tried: Steps that the solve of the last step has tried.
         ended: The reason why it ended; empty if it did not.
         history: One row for each step.
-        directions: The principal directions of the sensitivities.
         seconds: Time spent.
     """
 
@@ -187,7 +192,6 @@ class Course:
     tried: int = 0
     ended: str = ""
     history: list[dict[str, Any]] = field(default_factory=list)
-    directions: list[dict[str, Any]] = field(default_factory=list)
     seconds: float = 0.0
 
 
@@ -223,30 +227,22 @@ class Problem:
         self.say, self.judged = say or Say(False), tuple(judged)
         self.on_grid, self.looked = on_grid, list(looked)
         self.times = frame_times(videos)
-        fitted = max(3, round(plan.fit_share * len(self.times)))
+        fitted = max(3, round(0.5 * len(self.times)))
         if plan.until is not None:
             fitted = sum(time <= plan.until + 1e-6 for time in self.times)
             if fitted < 3:
                 raise ValueError(f"Fewer than three frames lie before `until` = {plan.until:g} s: raise it.")
         self.fitted = self.times[:fitted]
-        masked = any(video.masks is not None for video in videos)
-        self.stages = [stage for stage in plan.stages if masked or stage != "silhouettes"]
-        if not self.stages:
-            raise ValueError(
-                "The videos have no silhouettes: give `mask_path` or transparent images, or add tracks to `stages`."
-            )
         check_variants(simulation)
         self.sought = {unknown.name: k for k, unknown in enumerate(plan.unknowns)}
         self.begins = plan.unknowns[self.sought[FILM_START]] if FILM_START in self.sought else None
-        self.first_stage = "tracks" if self.stages[0] == "matches" else self.stages[0]
-        self.followed = "tracks" in (*self.stages, self.first_stage)
         self.moving = self.begins is not None and self.begins.low < 0
         self.first: list[float] = []
         self._tracks: list[Tracks] | None = None
         self._other_grids: list[Simulation] | None = None
         for video in self.videos:  # all cameras have to see the start of the motion, or a state before it
             begin, step = video.times[0], (video.times[-1] - video.times[0]) / max(len(video.times) - 1, 1)
-            if self.followed and begin > max([1.5 * step, *([self.begins.low] if self.begins else [])]):
+            if begin > max([1.5 * step, *([self.begins.low] if self.begins else [])]):
                 raise ValueError(
                     f"The frames of camera {video.name} begin at {begin:.3g} s, but points are followed from 0 s on: "
                     "cut all videos to the same beginning, or leave that camera out of `cameras`."
@@ -266,8 +262,8 @@ class Problem:
             self._tracks = [track(self.simulation, video, self.plan.tracks, shown) for video in self.videos]
             if sum(len(own.index) for own in self._tracks) < 4:
                 raise ValueError(
-                    "Fewer than four points of the object can be followed: give sharper videos, or use the `stages` "
-                    "silhouettes and pixels."
+                    "Fewer than four points of the object can be followed: give sharper videos of something that has "
+                    "texture."
                 )
         return self._tracks
 
@@ -278,7 +274,7 @@ class Problem:
 
     def look(self, folder: Path) -> list[Path]:
         """Write pictures to look at before the fit, into ``before`` of a folder, and return them."""
-        return write_before(folder / BEFORE, self.simulation, self.videos, self.tracks if self.followed else None)
+        return write_before(folder / BEFORE, self.simulation, self.videos, self.tracks)
 
     def begin_from(self, places: Tensor) -> list[float]:
         """Return which of some places (B, U) the first frame of a film in motion looks like most, with its best start.
@@ -303,23 +299,16 @@ class Problem:
                         best[column] = known.share(-ago)
         return [float(share) for share in best]
 
-    def evidence(self, stage: str, matched: Sequence[float] = ()) -> list[Evidence]:
-        """The residuals of a stage, one list entry for each video and kind; matches are made at ``matched``."""
-        if stage == "pixels":
-            return [PictureEvidence(video, masks=False) for video in self.videos]
-        tracks: list[Tracks] = []
-        if stage == "tracks" or (stage == "silhouettes" and "tracks" in self.stages):
-            tracks = self.tracks
-        elif stage == "matches":
+    def evidence(self, kind: str, matched: Sequence[float] = ()) -> list[Evidence]:
+        """What each video shows: ``tracks``, or ``matches`` that are made at a place."""
+        tracks = self.tracks if kind == "tracks" else []
+        if kind == "matches":
             states = dict(zip(self.fitted, self._states(matched, self.fitted), strict=True))
             for video in self.videos:
                 own = [state for moment, state in states.items() if video.frame_at(moment) is not None]
-                tracks.append(match(self.simulation, video, own, self.plan.tracks, self.moving))
-        pairs = zip(self.videos if tracks else [], tracks, strict=True)
-        found: list[Evidence] = [TrackEvidence(self.simulation, v, fitted_part(own), weighed=True) for v, own in pairs]
-        if stage == "silhouettes":
-            found += [PictureEvidence(video, masks=True) for video in self.videos if video.masks is not None]
-        return found
+                tracks = [*tracks, match(self.simulation, video, own, self.plan.tracks, self.moving)]
+        pairs = zip(self.videos, tracks, strict=True)
+        return [Evidence(self.simulation, video, fitted_part(own)) for video, own in pairs]
 
     def trusted(self, evidence: Sequence[Evidence], place: Sequence[float]) -> list[Evidence]:
         """The evidence, with less trust where other grids show something else at a place."""
@@ -349,7 +338,7 @@ class Problem:
     def residuals(self, evidence: Sequence[Evidence], times: Sequence[float]) -> Residuals:
         """The residuals of some evidence up to a horizon, as a function of places (B, U)."""
 
-        def at(places: Tensor) -> list[Block]:
+        def at(places: Tensor) -> Block:
             values = [self.values(place) for place in places]
             return compare(self.simulation, evidence, values, times, moving=self.moving, tick=self.say.tick)
 
@@ -361,23 +350,9 @@ class Problem:
         """Where the steps from a place end."""
         at = torch.tensor(place, dtype=torch.float64)
         with self.say.work(f"to {times[-1]:.3g} s", most * len(times) * (TRIES + 2 * len(at))):
-            return solve(self.residuals(evidence, times), _scaled(evidence), at, TRIES * most, closely)
+            return solve(self.residuals(evidence, times), at, TRIES * most, closely)
 
     # ---- the steps
-
-    def steps(self) -> list[tuple[str, float]]:
-        """Stage and horizon of every step: horizons grow up to the last matches, then all fitted frames are taken."""
-        found: list[tuple[str, float]] = []
-        for number, stage in enumerate(self.stages):
-            begun = HORIZONS if number == 0 else ()
-            if stage == "matches":
-                shares = (*begun[:1], *MATCHED)
-            elif "matches" in self.stages[number + 1 :]:
-                shares = begun or HORIZONS[-1:]
-            else:
-                shares = (*begun, 1.0)
-            found += [(stage, share) for share in shares]
-        return found
 
     def search(self) -> list[list[float]]:
         """Return the best starts of a coarse search: Sobol's sequence over the ranges, then draws around the best.
@@ -387,42 +362,40 @@ class Problem:
         first start. Simulations of similar stiffness are one batch.
         """
         unknowns, plan = self.plan.unknowns, self.plan
-        begin = [0.5 if u.start is None else u.share(u.start) for u in unknowns]
+        begin = torch.tensor([[0.5 if u.start is None else u.share(u.start) for u in unknowns]], dtype=torch.float64)
         given = any(u.start is not None for u in unknowns)
         sought = [u for u in unknowns if u.start is None or u.name in SPREAD]
-        moving = [self.sought[u.name] for u in sought if not u.name.startswith(("aero.", "solver."))]
-        first = begin
-        if plan.search and moving:
-            places = torch.tensor([begin]).repeat(max(1, 3 * plan.search // 4), 1).double()
-            sobol = torch.quasirandom.SobolEngine(len(moving), scramble=True, seed=plan.seed)
-            places[:, moving] = sobol.draw(len(places)).double()
-            first = self.begin_from(places[:BEGUN]) if self.moving and self.followed else []
-        if self.moving and self.followed:
-            self.begin_at(first)
-        if not plan.search or not moving:
-            return [begin]
-        evidence, times = self.evidence(self.first_stage), self._until(SEARCHED)
-        places = torch.cat([torch.tensor([begin] * given, dtype=torch.float64).reshape(-1, len(begin)), places])
-        near = torch.Generator().manual_seed(plan.seed)
-        shift = NEAR * torch.randn(plan.search - 3 * plan.search // 4, len(moving), generator=near, dtype=torch.float64)
+        free = [self.sought[u.name] for u in sought if not u.name.startswith(("aero.", "solver."))]
+        if not plan.search or not free:
+            if self.moving:
+                self.begin_at(begin[0].tolist())
+            return begin.tolist()
+        places = begin.repeat(max(1, 3 * plan.search // 4), 1)
+        places[:, free] = torch.quasirandom.SobolEngine(len(free), scramble=True, seed=0).draw(len(places)).double()
+        if self.moving:
+            self.begin_at(self.begin_from(places[:BEGUN]))
+        shape = plan.search - 3 * plan.search // 4, len(free)
+        shift = NEAR * torch.randn(shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+        def near(best: Tensor) -> Tensor:
+            found = best.repeat(len(shift), 1)
+            found[:, free] = (found[:, free] + shift).clamp(0.02, 0.98)
+            return found
+
+        evidence, times = self.evidence("tracks"), self._until(SEARCHED)
         with self.say.work("search", (given + plan.search + 16) * len(times)):
-            places, costs = self._coarse(places, evidence, times)
-            others = [torch.tensor(bent_alike(unknowns, places[int(costs.argmin())].tolist()), dtype=torch.float64)]
-            others += [torch.zeros(len(shift), len(begin), dtype=torch.float64)]
-            for other in others:
-                if not len(other):
-                    continue
-                if other is others[1]:
-                    other += places[int(costs.argmin())]
-                    other[:, moving] = (other[:, moving] + shift).clamp(0.02, 0.98)
-                tried = self._coarse(other, evidence, times)
-                places, costs = (torch.cat(pair) for pair in zip((places, costs), tried, strict=True))
+            places, costs = self._coarse(torch.cat([begin[: int(given)], places]), evidence, times)
+            for others in (lambda best: bent_alike(unknowns, best), near):
+                other = others(places[int(costs.argmin())])
+                if len(other):
+                    tried = self._coarse(other, evidence, times)
+                    places, costs = torch.cat([places, tried[0]]), torch.cat([costs, tried[1]])
         if not bool(torch.isfinite(costs).any()):
             raise DivergedError("Every simulation of the coarse search diverged: narrow the ranges of `unknowns`.")
         found = places[:1].tolist() if given else []
         for place in places[costs.argsort()].tolist():
             apart = all(apart_by(unknowns, place, other) > APART for other in found)
-            if len(found) < plan.starts and apart:
+            if len(found) < STARTS and apart:
                 found.append(place)
         return found
 
@@ -431,16 +404,15 @@ class Problem:
 
         In a steady wind one simulation shows what any start would.
         """
-        width = max(video.size[0] for video in self.videos)
-        scales = {kind: size * (width if kind in ("tracks", "matches") else 1) for kind, size in COARSE.items()}
+        scale = COARSE * max(video.size[0] for video in self.videos)
         values, known, tick = [self.values(place) for place in places], self.begins, self.say.tick
         if known is None or known.start is not None:
-            return places, cost_of(compare(self.simulation, evidence, values, times, False, self.moving, tick), scales)
+            return places, cost_of(compare(self.simulation, evidence, values, times, False, self.moving, tick), scale)
         step = max(times[1] - times[0], (known.high - known.low) / MOST_STARTS)
         numbers = range(math.ceil(known.low / step), math.floor(known.high / step) + 1)
         starts = [step * k for k in numbers] or [known.low]
         found = compare_starts(self.simulation, evidence, values, times, starts, tick)
-        costs, best = torch.stack([cost_of(blocks, scales) for blocks in found]).min(0)
+        costs, best = torch.stack([cost_of(block, scale) for block in found]).min(0)
         places = places.clone()
         shares = torch.tensor([known.share(start) for start in starts], dtype=places.dtype)
         places[:, self.sought[FILM_START]] = shares[best]
@@ -453,9 +425,9 @@ class Problem:
         """
         if len(places) < 2:
             return [list(place) for place in places]
-        evidence = self.evidence(self.first_stage)
+        evidence = self.evidence("tracks")
         kept, left = [list(place) for place in places], len(places)
-        for share in HORIZONS:
+        for share in (share for kind, share in STEPS if kind == "tracks"):
             times = self._until(share)
             ended, costs = self._brief(kept, evidence, times)
             for place, cost in zip(ended, costs, strict=True):
@@ -478,13 +450,13 @@ class Problem:
                 own, shown = copy(self), evidence
                 if shown is None:
                     own.begin_at(place)
-                    shown = own.trusted(own.evidence(self.first_stage), place)
+                    shown = own.trusted(own.evidence("tracks"), place)
                 found.append(own.solved(place, shown, times, BRIEF, False))
                 more.append(distrust(shown, times) if evidence is None else 0.0)
         if not found:
             raise DivergedError("Every simulation of a start diverged: narrow the ranges of `unknowns`.")
-        scales = {kind: min(own.scales[kind] for own in found) for kind in found[0].scales}
-        costs = [float(cost_of(own.blocks, scales)[0]) + other for own, other in zip(found, more, strict=True)]
+        scale = min(own.scale for own in found)
+        costs = [float(cost_of(own.block, scale)[0]) + other for own, other in zip(found, more, strict=True)]
         ends, apart = [own.place.tolist() for own in found], list[int]()
         for k in sorted(range(len(found)), key=costs.__getitem__):
             if all(apart_by(self.plan.unknowns, ends[k], ends[j]) > SAME for j in apart):
@@ -502,9 +474,8 @@ class Problem:
         tried = [*map(list, rivals), *rivals_of(model, unknowns, place)]
         if not tried:
             return [], []
-        alone = self.moving and self.followed
         try:
-            evidence = None if alone else self.trusted(self.evidence(self.first_stage), place)
+            evidence = None if self.moving else self.trusted(self.evidence("tracks"), place)
             ended, costs = self._brief([list(place), *tried], evidence, self.fitted)
         except DivergedError:
             return [], []
@@ -526,8 +497,8 @@ class Problem:
             for _ in states_of(self.simulation, [self.values(middle)] * batch, times):
                 pass
         rivals = len(rivals_of(self.simulation.model, self.plan.unknowns, middle)) + 1
-        count = SEARCHED * (self.plan.search + 16) + 3 * batch * sum(share for _, share in self.steps())
-        count += BRIEF * batch * (self.plan.starts * sum(HORIZONS) + rivals) + REFINED * batch * len(GRIDS)
+        count = SEARCHED * (self.plan.search + 16) + 3 * batch * sum(share for _, share in STEPS)
+        count += BRIEF * batch * (STARTS + rivals) + REFINED * batch * len(GRIDS)
         seconds = count * (time.monotonic() - begin) / batch
         told = f"about {count:.0f} simulations of {self.fitted[-1]:.3g} s: some {duration(seconds)}"
         if self.simulation.device.type == "cpu" and seconds > LONG:
@@ -543,7 +514,7 @@ class Problem:
             keep: Called after every step, to write the course.
             films: Folder for films beside the fit; None for none.
         """
-        clock, steps = time.monotonic() - course.seconds, self.steps()
+        clock = time.monotonic() - course.seconds
 
         def kept() -> None:
             course.seconds = time.monotonic() - clock
@@ -560,8 +531,7 @@ class Problem:
                 kept()
             course.place, *course.rivals = self.best_of(course.starts)
             self.say(f"search: {self._shown(course.place)}")
-            found = self._directions(course.place)
-            course.directions = [{"strength": d.strength, "parts": d.parts, "sentence": d.sentence} for d in found]
+            self._check_apart(course.place)
             course.step = 0
             kept()
         while True:
@@ -571,10 +541,10 @@ class Problem:
                 break
             self.say(f"another start fits better, so the fit goes on from there: {self._shown(better)}")
             course.rivals, course.place, course.rounds = [*course.rivals, course.place], better, course.rounds + 1
-            if self.moving and self.followed:
+            if self.moving:
                 self.begin_at(better)
                 course.first = list(better)
-            course.step, course.matched = next(k for k, (_, share) in enumerate(steps) if share == 1), []
+            course.step, course.matched = next(k for k, (_, share) in enumerate(STEPS) if share == 1), []
             course.tried, course.ended = 0, ""
             kept()
         result = self.result(course, evidence, films, others)
@@ -582,22 +552,21 @@ class Problem:
 
     def _stepped(self, course: Course, kept: Callable[[], None]) -> list[Evidence]:
         """Do the steps from that of the course on, and return the evidence of the last one."""
-        steps = self.steps()
-        for number in range(course.step, len(steps)):
-            (stage, share), last = steps[number], number == len(steps) - 1
+        for number in range(course.step, len(STEPS)):
+            (kind, share), last = STEPS[number], number == len(STEPS) - 1
             times, course.matched = self._until(share), course.matched or list(course.place)
-            evidence = self.evidence(stage, course.matched)
-            if share >= HORIZONS[-1]:
+            evidence = self.evidence(kind, course.matched)
+            if share >= TRUSTED:
                 evidence = self.trusted(evidence, course.matched)
             left = self.plan.iterations - course.tried // TRIES
             if course.ended or left <= 0:  # it is continued after its end
                 return evidence
             found = self.solved(course.place, evidence, times, left, last)
             course.place = found.place.tolist()
-            row = {"stage": stage, "horizon_s": times[-1], "steps": found.steps, "cost": found.cost}
-            row |= {"ended": found.ended} | {f"scale_{k}": v for k, v in found.scales.items()}
+            row = {"compared": kind, "until": times[-1], "steps": found.steps, "cost": found.cost}
+            row |= {"ended": found.ended, "pixels": found.scale}
             course.history.append(row | self.values(course.place))
-            self.say(f"{stage} to {times[-1]:.3g} s, {found.steps} steps: {self._shown(course.place)}")
+            self.say(f"{kind} to {times[-1]:.3g} s, {found.steps} steps: {self._shown(course.place)}")
             if last:
                 course.ended, course.tried = found.ended, course.tried + found.steps
             else:
@@ -609,29 +578,21 @@ class Problem:
         self, course: Course, evidence: Sequence[Evidence], films: Path | None, rivals: Sequence[Mapping[str, float]]
     ) -> Fit:
         """The result of a course that has ended, with the evidence of its last stage, and other answers."""
-        place = torch.tensor(course.place, dtype=torch.float64)
-        normal = linearised(self.residuals(evidence, self.fitted), _scaled(evidence), place)
-        followed = Followed(self.simulation, self.videos, self.tracks) if self.followed else None
-
-        def moved() -> Iterator[DeformedGaussians]:
-            runs = states_of(self.simulation, [self.values(place)], self.times, alike=False)
-            for moment, (state,) in zip(self.times, runs, strict=True):
-                if followed is not None and moment <= self.fitted[-1]:
-                    followed.add(moment, state)
-                yield self.simulation.painter.deformed(state)
-
-        shown = predictions(self.simulation, self.videos, self.times, len(self.fitted), moved(), films)
+        place, values = torch.tensor(course.place, dtype=torch.float64), self.values(course.place)
+        normal = linearised(self.residuals(evidence, self.fitted), place)
+        runs = states_of(self.simulation, [values], self.times, alike=False)
+        moved = (self.simulation.painter.deformed(state) for (state,) in runs)
         return Fit(
             self.plan.unknowns,
             tuple(course.place),
             normal.covariance() + self.grid_covariance(place, evidence),
             directions(normal.matrix, self.plan.unknowns, place),
-            shown,
+            predictions(self.simulation, self.videos, self.times, len(self.fitted), moved, films),
             course.history,
             course.seconds,
             unsettled(normal, place, self.plan.unknowns, course.ended),
             tuple(self.notes()),
-            {} if followed is None else followed.shares(),
+            explained(self.simulation, self.videos, self.tracks, values, self.fitted),
             judged=self.judged,
             rivals=rivals,
         )
@@ -644,13 +605,13 @@ class Problem:
         """
         found = torch.zeros(2 * (len(place),), dtype=torch.float64)
         for other in self.grids():
-            own = [e.on(other) if isinstance(e, TrackEvidence) else e for e in evidence]
+            own = [part.on(other) for part in evidence]
             there = copy(self)
             there.simulation = other
             with suppress(DivergedError):
                 end = there.solved(place.tolist(), own, self.fitted, REFINED, True).place
                 if torch.equal(end, place):
-                    end = step_from(linearised(there.residuals(own, self.fitted), _scaled(own), place), place)
+                    end = step_from(linearised(there.residuals(own, self.fitted), place), place)
                 found += torch.outer(end - place, end - place)
         return found
 
@@ -670,7 +631,7 @@ class Problem:
         return found + (self.looked or self._notes_on_start())
 
     def _notes_on_start(self) -> list[str]:
-        if self.begins is not None or not self.followed:
+        if self.begins is not None:
             return []
         still = min(still_until(self.simulation, v, own) for v, own in zip(self.videos, self.tracks, strict=True))
         if still >= LONG_STILL:
@@ -686,24 +647,17 @@ class Problem:
             ]
         return []
 
-    def _directions(self, place: Sequence[float]) -> list[Direction]:
-        """The principal directions at a place; ValueError if the unknowns cannot be told apart."""
-        at, evidence = torch.tensor(place, dtype=torch.float64), self.evidence(self.first_stage)
-        normal = linearised(self.residuals(evidence, self.fitted), _scaled(evidence), at)
+    def _check_apart(self, place: Sequence[float]) -> None:
+        """Raise ValueError if the unknowns cannot be told apart at a place."""
+        at = torch.tensor(place, dtype=torch.float64)
+        normal = linearised(self.residuals(self.evidence("tracks"), self.fitted), at)
         found = directions(normal.matrix, self.plan.unknowns, at)
         for direction in found:
             self.say(f"sensitivity {direction.strength:9.3g}: {direction.sentence}")
         check_apart(found, self.plan.unknowns, self.plan.limit)
-        return found
 
     def _shown(self, place: Sequence[float]) -> str:
         return ", ".join(f"{name} {value:.5g}" for name, value in self.values(place).items())
-
-
-def _scaled(evidence: Sequence[Evidence]) -> Callable[[Sequence[Block]], dict[str, float]]:
-    """The function that gives the standard deviations of a variant's residuals."""
-    floors = {part.kind: part.floor for part in evidence}
-    return lambda blocks: scales_of(blocks, floors)
 
 
 def unsettled(normal: Normal, place: Tensor, unknowns: Sequence[Unknown], ended: str) -> str:
@@ -717,7 +671,7 @@ def unsettled(normal: Normal, place: Tensor, unknowns: Sequence[Unknown], ended:
     if float(step.abs().amax()) <= FAR or gain <= GAIN:
         return ""
     why = {"": "`iterations` ran out", NO_STEP: "no step lowered the cost"}.get(ended, ended)
-    again = "put `pixels` last in `stages`, raise `search`, or give a `start` that is nearer"
+    again = "raise `search`, or give a `start` that is nearer"
     remedy = again if ended else "raise `iterations` and continue with --resume"
     told = f"{changes(step.tolist(), unknowns, place)}, to lower the cost by {gain:.2g} of itself"
     return f"The values have not settled: {why}, but the sensitivities ask for {told}: {remedy}."
@@ -793,14 +747,13 @@ def check_fit(plan: Plan, output: str | os.PathLike[str], *, device: str = "auto
 
 
 def _ready(plan: Plan, parser: Any, settings: Any, device: str, progress: bool) -> Problem:
-    if {"tracks", "matches"} & set(plan.stages):
-        opencv()  # before anything that takes time
+    opencv()  # before anything that takes time
     settings.device = device
     own = settings.clone()
     own.camera = own.cameras = None  # the videos have their own
     simulation, say = Simulation.from_settings(parser, own), Say(progress)
     videos = read_videos(list(plan.videos), plan.cameras, simulation.scene.size, simulation.scene.model.origin)
-    looked = _looked(simulation, videos, plan) if find_spec("cv2") else []
+    looked = _looked(simulation, videos, plan)
     with say.work("the camera of each frame", sum(len(video.times) for video in videos)):
         videos, judged = prepared(simulation, videos, plan.hand_held, plan.also_moves, say, say.tick)
 
@@ -849,8 +802,7 @@ def fit(
         resume: Continue the fit in it.
         device: ``auto``, ``cpu`` or ``cuda``.
         progress: Print a line for each step, and a bar.
-        settings: Further fields of :class:`~gaussian_swaying.inverse.plan.Plan`, such as ``known``, ``stages`` and
-            ``fit_share``.
+        settings: Further fields of :class:`~gaussian_swaying.inverse.plan.Plan`, such as ``known`` and ``until``.
 
     Returns:
         Values with standard errors, what the video cannot tell apart, and the error of the predicted frames.

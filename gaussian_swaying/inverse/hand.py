@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from gaussian_swaying.geometry.rotations import rotation_of
 from gaussian_swaying.inverse.registration import LEAST, SOLID, Registration, grey_of, refine
 from gaussian_swaying.inverse.tracks import STILL, follow, opencv
 from gaussian_swaying.inverse.videos import Footage
@@ -171,79 +168,24 @@ def follow_camera(
             "stands still in the splat: stand it on a tripod, or film something still and textured, too, and have it "
             "in the splat."
         )
-    picture, still = background.draw(video.cameras[0])
-    depth = (picture.depth / picture.alpha.clamp(min=1e-3))[..., 0].cpu()
-    far = float(depth[still if bool(still.any()) else depth > 0].median())
-    like = video.cameras[0]
-    middle = like.position.double().cpu() + far * like.world_to_camera[2, :3].double().cpu()
-    views = [
-        (camera, camera.world_to_camera.to(like.world_to_camera)) for camera in smoothed(found, video.times, middle)
-    ]
     residual = torch.tensor([one.residual for one in found if one is not None]).median()
-    return Motion(tuple(replace(camera, world_to_camera=view) for camera, view in views), unseen, float(residual))
+    return Motion(_filled(video, found), unseen, float(residual))
 
 
-def smoothed(found: Sequence[Registration | None], times: Sequence[float], pivot: Tensor) -> list[Camera]:
-    """Smooth cameras in time, and fill in those that are missing (None) from their neighbours.
-
-    Six numbers are smoothed: the rotation, and where the camera sees a point in the middle of the background, ``pivot``
-    (3,) [scene units]. An error of the rotation hardly changes the latter.
-    """
+def _filled(video: Footage, found: Sequence[Registration | None]) -> tuple[Camera, ...]:
+    """The cameras of all frames; those that are missing (None) lie between their neighbours in time."""
     import numpy as np
+    from scipy.spatial.transform import Rotation, Slerp
 
-    known = [(time, one) for time, one in zip(times, found, strict=True) if one is not None]
-    moments, base = [time for time, _ in known], known[0][1].camera.world_to_camera[:3, :3]
-    numbers, errors = torch.zeros(2, len(known), 6, dtype=torch.float64)
-    for k, (_, one) in enumerate(known):
-        view = one.camera.world_to_camera
-        seen, turn = view[:3, :3] @ pivot, view[:3, :3] @ base.T
-        numbers[k] = torch.cat([torch.from_numpy(opencv().Rodrigues(turn.numpy())[0][:, 0]), seen + view[:3, 3]])
-        change = torch.eye(6, dtype=torch.float64)
-        change[3:, :3] = -torch.linalg.cross(seen.expand(3, 3), torch.eye(3, dtype=torch.float64)).T
-        errors[k] = (change @ one.spread @ change.T).diagonal().sqrt()
-    own = [smooth(*pair) for pair in zip(numbers.T.numpy(), errors.T.numpy(), strict=True)]
-    filled = torch.from_numpy(np.stack([np.interp(times, moments, one) for one in own], 1))
-    result = []
-    for turn, place in zip(*filled.split(3, 1), strict=True):
-        view = torch.eye(4, dtype=torch.float64)
-        view[:3, :3] = rotation_of(turn) @ base
-        view[:3, 3] = place - view[:3, :3] @ pivot
-        result.append(replace(known[0][1].camera, world_to_camera=view))
-    return result
-
-
-def smooth(values: Any, errors: Any) -> Any:
-    """The most likely course of a number whose second differences are random, seen with noise.
-
-    It minimises the sum of squares of noise over its standard error and of second differences over their standard
-    deviation, which has the largest marginal likelihood of a grid.
-
-    Args:
-        values: What was seen at equal steps of time, NumPy array, float64, shape (N,).
-        errors: Standard errors, shape (N,).
-
-    Returns:
-        Shape (N,); with fewer than four values these.
-    """
-    import numpy as np
-    from scipy.linalg import cho_solve_banded, cholesky_banded
-
-    count = len(values)
-    if count < 4:
-        return values
-    rough, difference = np.zeros((3, count)), (1.0, -2.0, 1.0)
-    for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2)):  # upper bands of the squares of second differences
-        rough[2 - j + i, j : count - 2 + j] += difference[i] * difference[j]
-    weights, best, found = errors**-2.0, -np.inf, values
-    for variance in np.median(errors) ** 2 * np.logspace(-6, 6, 49):
-        bands = rough / variance
-        bands[2] += weights
-        factor = cholesky_banded(bands)
-        course = cho_solve_banded((factor, False), weights * values)
-        likelihood = (weights * values * course).sum() - 2 * np.log(factor[2]).sum() - (count - 2) * np.log(variance)
-        if likelihood > best:
-            best, found = likelihood, course
-    return found
+    known = [(time, one.camera) for time, one in zip(video.times, found, strict=True) if one is not None]
+    moments, poses = [time for time, _ in known], torch.stack([one.world_to_camera.double() for _, one in known])
+    poses = torch.linalg.inv(poses).numpy()
+    times = np.clip(video.times, moments[0], moments[-1])
+    pose = np.zeros((len(times), 4, 4)) + np.eye(4)
+    pose[:, :3, :3] = Slerp(moments, Rotation.from_matrix(poses[:, :3, :3]))(times).as_matrix()
+    pose[:, :3, 3] = np.stack([np.interp(times, moments, own) for own in poses[:, :3, 3].T], 1)
+    views = torch.linalg.inv(torch.from_numpy(pose)).to(video.cameras[0].world_to_camera)
+    return tuple(replace(known[0][1], world_to_camera=view) for view in views)
 
 
 def _carried(given: Camera, before: Camera, found: Camera) -> Camera:
@@ -387,9 +329,6 @@ def prepared(
                 "`hand_held` needs something that stands still in the splat, but all of it moves: stand the camera on "
                 "a tripod, or have something still and textured, too, in the film and in the splat."
             )
-        return list(videos), []
-    if not hand_held and find_spec("cv2") is None:
-        say("Without OpenCV nothing says whether a camera moves, or its exposure drifts.")
         return list(videos), []
     found, judged = [], []
     for video in videos:

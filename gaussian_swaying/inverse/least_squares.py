@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import torch
@@ -27,32 +26,30 @@ last stage, and of the others."""
 RESCALED, ALIKE = 4, 1.1
 """Most times that the standard deviations of the residuals are estimated, and ratio below which they stay."""
 
+LEAST = 0.05
+"""Least standard deviation of the residuals [pixels]."""
+
 NO_STEP = "no step is better"
+DIVERGED = "Every simulation of a step diverged: narrow the ranges of `unknowns`."
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Residuals of one kind.
+    """Residuals of some variants.
 
     Attributes:
-        kind: ``tracks``, ``silhouettes`` or ``pixels``.
-        values: Differences between simulation and video for each variant, float64, shape (B, R, D); in pixels for
-            tracks, else in grey levels from 0 to 1.
+        values: Places in the simulation minus those in the film [pixels], for each variant, float64, shape (B, R, D).
         cluster: Index of the cluster of correlated residuals that each belongs to, shape (R,).
         moment: Index of the part of the time that each belongs to, shape (R,); None if all are of one.
     """
 
-    kind: str
     values: Tensor
     cluster: Tensor
     moment: Tensor | None = None
 
 
-Residuals = Callable[[Tensor], list[Block]]
+Residuals = Callable[[Tensor], Block]
 """Residuals at some points (B, U), each a share of every range."""
-
-Rescale = Callable[[Sequence[Block]], dict[str, float]]
-"""Robust standard deviation of the first variant's residuals, for each kind."""
 
 
 class DivergedError(ValueError):
@@ -61,70 +58,79 @@ class DivergedError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """An end: its place (U,), its residuals and their standard deviations, and why no more steps were tried.
+    """An end: its place (U,), its residuals and their standard deviation, and why no more steps were tried.
 
     ``ended`` is empty if their number ran out; ``steps`` counts them.
     """
 
     place: Tensor
-    blocks: list[Block]
-    scales: dict[str, float]
+    block: Block
+    scale: float
     ended: str
     steps: int
 
     @property
     def cost(self) -> float:
         """Mean of Huber's function over all residuals, each in standard deviations."""
-        return float(cost_of(self.blocks, self.scales)[0])
+        return float(cost_of(self.block, self.scale)[0])
 
 
-def cost_of(blocks: Sequence[Block], scales: Mapping[str, float]) -> Tensor:
+def cost_of(block: Block, scale: float) -> Tensor:
     """Cost of each variant, shape (B,); infinite for one that is not finite."""
-    size = torch.cat([(block.values / scales[block.kind]).abs().flatten(1) for block in blocks], 1)
+    size = (block.values / scale).abs().flatten(1)
     total = torch.where(size < HUBER, 0.5 * size.square(), HUBER * (size - 0.5 * HUBER)).sum(1)
-    count = sum(block.values.shape[1] for block in blocks)
-    return torch.where(torch.isfinite(total), total, float("inf")) / max(count, 1)
+    return torch.where(torch.isfinite(total), total, float("inf")) / max(block.values.shape[1], 1)
 
 
-def solve(residuals: Residuals, rescale: Rescale, place: Tensor, most: int, closely: bool = False) -> Solved:
+def scale_of(block: Block, least: float = LEAST) -> float:
+    """Robust standard deviation of the residuals of the first variant, from the median of their lengths."""
+    from scipy.stats import chi
+
+    size = block.values[0].norm(dim=-1)
+    middle = float(size.nanmedian()) if len(size) else 0.0
+    return max(0.0 if math.isnan(middle) else middle / chi.median(block.values.shape[-1]), least)
+
+
+def solve(
+    residuals: Residuals, place: Tensor, most: int, closely: bool = False, scale: Callable[[Block], float] = scale_of
+) -> Solved:
     """Minimise the cost from a place by SciPy's dogleg within the ranges.
 
-    Standard deviations of the residuals are estimated anew where it ends, until they stay.
+    The standard deviation of the residuals is estimated anew where it ends, until it stays.
 
     Args:
         residuals: Computes residuals.
-        rescale: Standard deviations of the first variant's residuals.
         place: Where to begin, shape (U,).
         most: Most steps that are tried.
         closely: Whether small steps count.
+        scale: Standard deviation of the first variant's residuals.
     """
     from scipy.optimize import least_squares
 
     xtol, ftol = CLOSELY if closely else ROUGHLY
     begin, tried, ended = place.double(), 0, ""
-    blocks = residuals(begin[None])
+    block = residuals(begin[None])
     for _ in range(RESCALED):
-        scales = rescale(blocks)
-        known: dict[bytes, list[Block]] = {begin.numpy().tobytes(): blocks}
-        used = _flat(blocks, scales)[0].isfinite()
+        sigma, known = scale(block), {begin.numpy().tobytes(): block}
+        used = block.values[0].flatten().isfinite()
         if not bool(used.any()):
-            raise DivergedError("Every simulation of a step diverged: narrow the ranges of `unknowns`.")
+            raise DivergedError(DIVERGED)
 
-        def at(shift: Any, begin: Tensor, scales: dict[str, float], used: Tensor, known: dict[bytes, Any]) -> Any:
+        def at(shift: Any, begin: Tensor, sigma: float, used: Tensor, known: dict[bytes, Block]) -> Any:
             there = begin + torch.from_numpy(shift)
             key = there.numpy().tobytes()
             known[key] = known.get(key) or residuals(there[None])
-            return _flat(known[key], scales)[0, used].numpy()
+            return (known[key].values[0].flatten()[used].double() / sigma).numpy()
 
-        def slopes(shift: Any, begin: Tensor, scales: dict[str, float], used: Tensor) -> Any:
+        def slopes(shift: Any, begin: Tensor, sigma: float, used: Tensor, known: dict[bytes, Block]) -> Any:
             both, widths = _beside(begin + torch.from_numpy(shift))
-            high, low = _flat(residuals(both), scales)[:, used].chunk(2)
+            high, low = (residuals(both).values.flatten(1)[:, used].double() / sigma).chunk(2)
             return torch.nan_to_num((high - low) / widths[:, None], posinf=0.0, neginf=0.0).T.numpy()
 
-        found = least_squares(
-            partial(at, begin=begin, scales=scales, used=used, known=known),
+        found = least_squares(  # of shifts from the place, as its first step is then no longer than `x_scale`
+            at,
             0 * begin.numpy(),
-            partial(slopes, begin=begin, scales=scales, used=used),
+            slopes,
             bounds=((-begin).numpy(), (1 - begin).numpy()),
             method="dogbox",
             x_scale=REACH,
@@ -134,24 +140,19 @@ def solve(residuals: Residuals, rescale: Rescale, place: Tensor, most: int, clos
             ftol=ftol,
             gtol=None,
             max_nfev=1 + most - tried,
+            args=(begin, sigma, used, known),
         )
         tried += found.nfev - 1
         end = (begin + torch.from_numpy(found.x)).clamp(0.0, 1.0)
         moved, begin = float((end - begin).abs().amax()), end
-        blocks = known.get(end.numpy().tobytes()) or residuals(end[None])
+        block = known.get(end.numpy().tobytes()) or residuals(end[None])
         ended = {0: "", 2: f"the last step lowered the cost by less than {ftol:.2%}"}.get(
             found.status, f"the last step was below {xtol:g} of every range"
         )
-        now = rescale(blocks)
-        alike = all(max(now[k] / scales[k], scales[k] / now[k]) < ALIKE for k in scales)
-        if moved < xtol or alike or tried >= most:
+        now = scale(block)
+        if moved < xtol or max(now / sigma, sigma / now) < ALIKE or tried >= most:
             break
-    return Solved(begin, blocks, rescale(blocks), NO_STEP if ended and moved == 0 else ended, tried)
-
-
-def _flat(blocks: Sequence[Block], scales: Mapping[str, float]) -> Tensor:
-    """All residuals in standard deviations, shape (B, N)."""
-    return torch.cat([(block.values / scales[block.kind]).flatten(1) for block in blocks], 1).double()
+    return Solved(begin, block, now, NO_STEP if ended and moved == 0 else ended, tried)
 
 
 def _beside(place: Tensor) -> tuple[Tensor, Tensor]:
@@ -199,31 +200,24 @@ class Normal:
         return inverse @ middle @ inverse + inverse
 
 
-def linearised(residuals: Residuals, rescale: Rescale, place: Tensor) -> Normal:
+def linearised(residuals: Residuals, place: Tensor, scale: Callable[[Block], float] = scale_of) -> Normal:
     """Normal equations at a place, from central differences of one batch."""
     both, widths = _beside(place)
-    blocks = residuals(torch.cat([place[None], both]))
-    scales, unknowns, count = rescale(blocks), len(place), 0
-    gradient, matrix = torch.zeros(unknowns).double(), torch.zeros(unknowns, unknowns).double()
-    sums: tuple[list[Tensor], list[Tensor]] = ([], [])
-    for block in blocks:
-        values = block.values.double() / scales[block.kind]
-        residual, change = values[0], (values[1 : 1 + unknowns] - values[1 + unknowns :]) / widths[:, None, None]
-        usable = torch.isfinite(residual).all(-1) & torch.isfinite(change).all(-1).all(0)
-        weight = usable[:, None] * (HUBER / residual.abs().clamp(min=HUBER).nan_to_num(1.0))
-        residual, change = residual.nan_to_num(0.0), change.nan_to_num(0.0)
-        own = (change * residual * weight).sum(-1).mT  # (R, U)
-        flat = (change * weight.sqrt()).flatten(1)
-        gradient, matrix, count = gradient + own.sum(0), matrix + flat @ flat.mT, count + int(usable.sum())
-        moment = torch.zeros_like(block.cluster) if block.moment is None else block.moment
-        for several, index in zip(sums, (block.cluster, moment), strict=True):
-            several.append(own.new_zeros(1 + int(index.max()) if len(index) else 0, unknowns).index_add(0, index, own))
-    moments = torch.zeros(max(map(len, sums[1])), unknowns).double()
-    for one in sums[1]:
-        moments[: len(one)] += one
-    if count == 0:
-        raise DivergedError("Every simulation of a step diverged: narrow the ranges of `unknowns`.")
-    return Normal(float(cost_of(blocks, scales)[0]), gradient, matrix, (torch.cat(sums[0]), moments), count)
+    block, unknowns = residuals(torch.cat([place[None], both])), len(place)
+    sigma = scale(block)
+    values = block.values.double() / sigma
+    residual, change = values[0], (values[1 : 1 + unknowns] - values[1 + unknowns :]) / widths[:, None, None]
+    usable = torch.isfinite(residual).all(-1) & torch.isfinite(change).all(-1).all(0)
+    if not bool(usable.any()):
+        raise DivergedError(DIVERGED)
+    weight = usable[:, None] * (HUBER / residual.abs().clamp(min=HUBER).nan_to_num(1.0))
+    residual, change = residual.nan_to_num(0.0), change.nan_to_num(0.0)
+    own = (change * residual * weight).sum(-1).mT  # (R, U)
+    flat = (change * weight.sqrt()).flatten(1)
+    moment = torch.zeros_like(block.cluster) if block.moment is None else block.moment
+    scores = [own.new_zeros(1 + int(one.max()), unknowns).index_add(0, one, own) for one in (block.cluster, moment)]
+    cost = float(cost_of(block, sigma)[0])
+    return Normal(cost, own.sum(0), flat @ flat.mT, (scores[0], scores[1]), int(usable.sum()))
 
 
 def step_from(normal: Normal, place: Tensor) -> Tensor:
@@ -242,18 +236,3 @@ def expected_gain(normal: Normal, step: Tensor) -> float:
     """Expected relative decrease of the cost for a step, with linearised residuals."""
     fall = -(normal.gradient @ step + 0.5 * step @ normal.matrix @ step) / max(normal.count, 1)
     return float(fall) / max(normal.cost, 1e-300)
-
-
-def scales_of(blocks: Sequence[Block], floors: Mapping[str, float]) -> dict[str, float]:
-    """Robust standard deviation of the residuals of the first variant, for each kind: from the median of their sizes.
-
-    ``floors`` are the least ones.
-    """
-    found = {}
-    for block in blocks:
-        size = block.values[0].norm(dim=-1)
-        # median of the norm of D standard normal numbers, to within a percent
-        middle = {1: 0.6745, 2: 1.1774, 3: 1.5382}[block.values.shape[-1]]
-        sigma = float(size.nanmedian()) / middle if size.numel() else 0.0
-        found[block.kind] = max(0.0 if math.isnan(sigma) else sigma, floors[block.kind])
-    return found

@@ -25,21 +25,19 @@ HELD_TINT, MOVING, STILL_TINT = (0.85, 0.1, 0.1), (0.1, 0.65, 0.25), (0.55, 0.55
 
 
 def write_before(
-    folder: Path, simulation: Simulation, videos: Sequence[Footage], tracks: Sequence[Tracks] | None
+    folder: Path, simulation: Simulation, videos: Sequence[Footage], tracks: Sequence[Tracks]
 ) -> list[Path]:
-    """Write ``rest_CAMERA.png`` and, if points are followed, ``tracks_CAMERA.png``, and return the files."""
+    """Write ``rest_CAMERA.png`` and ``tracks_CAMERA.png``, and return the files."""
     import imageio.v3 as iio
 
     folder.mkdir(parents=True, exist_ok=True)
-    files = []
-    for number, video in enumerate(videos):
-        pictures = {f"rest_{video.name}.png": _at_rest(simulation, video)}
-        if tracks is not None:
-            pictures[f"tracks_{video.name}.png"] = _tracks_picture(video, tracks[number])
-        for name, picture in pictures.items():
-            iio.imwrite(folder / name, picture)
-            files.append(folder / name)
-    return files
+    found = {}
+    for video, own in zip(videos, tracks, strict=True):
+        found[folder / f"rest_{video.name}.png"] = _at_rest(simulation, video)
+        found[folder / f"tracks_{video.name}.png"] = _tracks_picture(video, own)
+    for path, picture in found.items():
+        iio.imwrite(path, picture)
+    return list(found)
 
 
 def side_by_side(frame: Tensor, shown: RenderOutput) -> list[tuple[str, Tensor]]:
@@ -83,8 +81,8 @@ def _tracks_picture(video: Footage, tracks: Tracks) -> Any:
     return titled([(told, torch.from_numpy(np.asarray(picture).copy()).float() / 255)])
 
 
-def titled(panels: Sequence[tuple[str, Tensor]], rows: Sequence[str] = ()) -> Any:
-    """Pictures (H, W, 3) side by side, colours in [0, 1], as a NumPy array; titles are above each and on rows."""
+def titled(panels: Sequence[tuple[str, Tensor]]) -> Any:
+    """Pictures (H, W, 3) side by side, colours in [0, 1], as a NumPy array, with a title above each."""
     import numpy as np
     from PIL import Image, ImageDraw, ImageFont
 
@@ -95,7 +93,4 @@ def titled(panels: Sequence[tuple[str, Tensor]], rows: Sequence[str] = ()) -> An
     draw, font = ImageDraw.Draw(picture), ImageFont.load_default(13)
     for number, (title, _) in enumerate(panels):
         draw.text((number * width // len(panels) + 6, 3), title, fill=(0, 0, 0), font=font)
-    for number, told in enumerate(rows):
-        where = (6, BAND + number * height // len(rows) + 3)
-        draw.text(where, told, fill=(255, 255, 255), font=font, stroke_width=1, stroke_fill=(0, 0, 0))
     return np.asarray(picture)

@@ -20,10 +20,6 @@ from gaussian_swaying.simulation.simulation import Simulation
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
-STAGES = ("tracks", "silhouettes", "matches", "pixels")
-"""Stages of a fit, in this order: tracks from frame to frame; silhouettes; Gaussians matched from rendered frames to
-frames of the video; colours."""
-
 ASSUMED = ("length", "mass", "camera")
 """Things in a base that nobody measured, perhaps."""
 
@@ -37,15 +33,11 @@ class Plan:
         videos: Folders with transforms.json.
         unknowns: The unknowns.
         known: Options of ``sim`` that replace those of the base.
-        stages: The stages, see :data:`STAGES`; silhouettes are left out if the video has none.
-        fit_share: Share of the frames that is fitted; the rest is predicted.
-        until: Fit the frames up to this time [s] instead of a share of them.
+        until: Fit the frames up to this time [s], half of them if it is None; the rest is predicted.
         search: Number of simulations of the coarse search; 0 starts at ``start`` or in the middle of the ranges.
-        starts: Number of starts that the search gives to short solves, of which the best goes on.
-        iterations: Most iterations of a stage at each horizon.
+        iterations: Most iterations of a step.
         tracks: Most tracks of a camera.
         limit: Largest condition number of the sensitivities; above it the fit is refused.
-        seed: Seed of the coarse search.
         cameras: Names of the cameras that are used; None for all.
         assumed: What nobody measured, of :data:`ASSUMED`; the result says what follows.
         hand_held: Whether the cameras move otherwise than the videos say; None if their background is to tell.
@@ -56,29 +48,20 @@ class Plan:
     videos: Sequence[str]
     unknowns: Sequence[Unknown]
     known: Mapping[str, Any] = field(default_factory=dict)
-    stages: Sequence[str] = ("tracks", "matches")
-    fit_share: float = 0.5
     until: float | None = None
     search: int = 64
-    starts: int = 3
     iterations: int = 8
     tracks: int = 400
     limit: float = 1e3
-    seed: int = 0
     cameras: Sequence[str] | None = None
     assumed: Sequence[str] = ()
     hand_held: bool | None = None
     also_moves: Sequence[str] = ()
 
     def __post_init__(self) -> None:
-        for name, known in (("stages", STAGES), ("assumed", ASSUMED)):
-            for given in getattr(self, name):
-                check_choice(name, given, known)
-        if not self.stages:
-            raise ValueError(f"Expected `stages` to have at least one of {', '.join(STAGES)}.")
-        if not 0 < self.fit_share <= 1:
-            raise ValueError(f"Expected `fit_share` above 0 and at most 1, but got {self.fit_share}.")
-        for name, least in (("search", 0), ("starts", 1), ("iterations", 1), ("tracks", 4), ("seed", 0)):
+        for given in self.assumed:
+            check_choice("assumed", given, ASSUMED)
+        for name, least in (("search", 0), ("iterations", 1), ("tracks", 4)):
             check_whole(name, getattr(self, name), least)
         if not self.limit > 1:
             raise ValueError(f"Expected `limit` above 1, but got {self.limit}.")
@@ -106,7 +89,7 @@ def read_plan(path: str | os.PathLike[str], find: Callable[[str], str] = str) ->
         )
     settings = {name: given[name] for name in names[4:] if given.get(name) is not None}
     listed = {name: _names(file, name, given.get(name)) for name in ("base", "videos")}
-    for name in ("stages", "cameras", "assumed", "also_moves"):
+    for name in ("cameras", "assumed", "also_moves"):
         if name in settings:
             settings[name] = _names(file, name, settings[name])
     check_arguments(Plan.__init__, settings, str(file))

@@ -17,7 +17,7 @@ from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.gaussians.measures import Gaussians
 from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.geometry.origin import Origin
-from gaussian_swaying.inverse.tracks import follow, opencv, window_of
+from gaussian_swaying.inverse.tracks import follow, opencv
 from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
 from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.suggestion.up import guess_up
@@ -58,15 +58,12 @@ class Registration:
         matches: Points that were matched at the end.
         agreeing: Those that agree on the camera.
         residual: Root mean square of their distances [pixels].
-        spread: Covariance of a small rotation of the camera's axes [rad], and of a shift along them [scene units],
-            float64, shape (6, 6). Points nearer than the window in which they are followed count as one.
     """
 
     camera: Camera
     matches: int
     agreeing: int
     residual: float
-    spread: Tensor
 
 
 def painter_of(cloud: GaussianCloud) -> Draw:
@@ -334,11 +331,7 @@ def _seen_from(
     view[:3, :3], view[:3, 3] = cv2.Rodrigues(turn)[0], shift.reshape(3)
     seen = replace(camera, world_to_camera=torch.from_numpy(view), intrinsics=torch.from_numpy(np.asarray(K, float)))
     residual = float(np.sqrt((off**2).sum(1).mean()))
-    slope = _slope(torch.from_numpy(world), seen)
-    apart = len(set(map(tuple, (there // window_of(camera.width, camera.height)).astype(int).tolist())))
-    variance = 0.5 * residual**2 * len(world) / apart
-    spread = variance * torch.linalg.pinv(slope.T @ slope, hermitian=True)
-    return Registration(seen, int(known.sum()), len(index), residual, spread)
+    return Registration(seen, int(known.sum()), len(index), residual)
 
 
 def _agreeing(cv2: Any, world: Any, there: Any, K: Any, near: float, turn: Any, shift: Any) -> tuple[Any, Any, Any]:
@@ -352,15 +345,3 @@ def _agreeing(cv2: Any, world: Any, there: Any, K: Any, near: float, turn: Any, 
             break
         turn, shift = cv2.solvePnPRefineLM(world[index], there[index], K, None, turn, shift)
     return index, turn, shift
-
-
-def _slope(places: Tensor, camera: Camera) -> Tensor:
-    """Derivatives of the pixels of places (N, 3) by a small rotation of the camera's axes and a shift, (2N, 6)."""
-    view, K = camera.world_to_camera, camera.intrinsics
-    local = places @ view[:3, :3].T + view[:3, 3]
-    x, y, z = local.unbind(1)
-    zero = torch.zeros_like(z)
-    by_place = torch.stack([K[0, 0] / z, zero, -K[0, 0] * x / z**2, zero, K[1, 1] / z, -K[1, 1] * y / z**2], 1)
-    by_place = by_place.unflatten(1, (2, 3))
-    by_turn = torch.linalg.cross(local[:, None].expand_as(by_place), by_place)
-    return torch.cat([by_turn, by_place], 2).flatten(0, 1)

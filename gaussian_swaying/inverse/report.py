@@ -31,9 +31,6 @@ if TYPE_CHECKING:
 
 PICTURES = "pictures"
 
-SHOWN = 3
-"""Frames of the fitted and of the predicted part in a picture."""
-
 ASTRAY = 6.0
 """Largest accepted PSNR loss of fitted frames against the frame at rest [dB]; 6 dB is four times the squared error."""
 
@@ -56,16 +53,12 @@ class Shown:
         fitted: PSNR of the fitted frames [dB].
         predicted: PSNR of the predicted frames [dB]; NaN if there are none.
         rest: PSNR of the first frame, at rest [dB]: what noise, light and the splat itself leave, before any motion.
-        picture: Rows of video, simulation and difference, dtype uint8, shape (H, W, 3).
-        rows: A label for each row, such as ``0.5 s, fitted``.
     """
 
     camera: str
     fitted: float
     predicted: float
     rest: float
-    picture: Tensor
-    rows: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,31 +205,21 @@ def predictions(
         moved: All Gaussians at each of the times.
         films: Folder for ``film_CAMERA.mp4``: the video beside the fit.
     """
-    chosen = [_chosen(video, times, fitted) for video in videos]
     squares: list[tuple[list[float], list[float]]] = [([], []) for _ in videos]
-    rows: list[list[tuple[str, Tensor]]] = [[] for _ in videos]
     painter = simulation.painter
     with _films(films, videos) as add:
         for k, (time, gaussians) in enumerate(zip(times, moved, strict=True)):
             for number, video in enumerate(videos):
-                frame = video.frame_at(time)
-                if frame is None:
+                if (frame := video.frame_at(time)) is None:
                     continue
                 drawn = painter.picture(gaussians, video.cameras[frame].to(painter.device))
-                shown = drawn.color.clamp(0, 1).float().cpu()
-                real = video.images[frame].float() / 255
+                shown, real = drawn.color.clamp(0, 1).float().cpu(), video.images[frame].float() / 255
                 squares[number][k >= fitted].append(float((shown - real).square().mean()))
-                part = "predicted" if k >= fitted else "fitted"
-                add(number, [(f"film, {time:.2f} s", real), (part, shown)])
-                if k in chosen[number]:
-                    difference = (0.5 + 0.5 * (shown - real)).clamp(0, 1)
-                    rows[number].append((f"{time:.3g} s, {part}", torch.cat([real, shown, difference], 1)))
-    found = []
-    for video, own, row in zip(videos, squares, rows, strict=True):
-        picture = (torch.cat([part for _, part in row]) * 255).round().to(torch.uint8)
-        psnr = (_psnr(own[0]), _psnr(own[1]), _psnr(own[0][:1]))
-        found.append(Shown(video.name, *psnr, picture, tuple(told for told, _ in row)))
-    return found
+                add(number, [(f"film, {time:.2f} s", real), ("predicted" if k >= fitted else "fitted", shown)])
+    return [
+        Shown(video.name, _psnr(before), _psnr(after), _psnr(before[:1]))
+        for video, (before, after) in zip(videos, squares, strict=True)
+    ]
 
 
 @contextmanager
@@ -265,15 +248,7 @@ def _films(folder: Path | None, videos: Sequence[Footage]) -> Iterator[Callable[
 def write_results(
     folder: Path, result: Fit, parser: ArgumentParser, settings: Namespace, simulation: Simulation
 ) -> None:
-    """Write ``values.csv``, ``result.json``, ``scene.yaml`` and the folder ``pictures``."""
-    import imageio.v3 as iio
-
-    pictures = folder / PICTURES
-    pictures.mkdir(exist_ok=True)
-    for one in result.shown:
-        names = ("video", "simulation", "difference (grey: none)")
-        panels = (one.picture.float() / 255).split(one.picture.shape[1] // 3, 1)
-        iio.imwrite(pictures / f"{one.camera}.png", titled(list(zip(names, panels, strict=True)), one.rows))
+    """Write ``values.csv``, ``result.json`` and ``scene.yaml``."""
     write_table(folder / "values.csv", result.rows())
     failed, doubtful = result.doubts()
     write_json(
@@ -371,16 +346,6 @@ def wind_seen(values: Mapping[str, float], videos: Sequence[Footage], simulation
     return found
 
 
-def _chosen(video: Footage, times: Sequence[float], fitted: int) -> set[int]:
-    """Numbers of the times whose frames are in a picture: up to :data:`SHOWN` fitted and as many predicted ones."""
-    own = [k for k, time in enumerate(times) if video.frame_at(time) is not None]
-    found: set[int] = set()
-    for part in ([k for k in own if 0 < k < fitted], [k for k in own if k >= fitted]):
-        count = min(SHOWN, len(part))
-        found |= {part[(k + 1) * len(part) // count - 1] for k in range(count)}
-    return found or set(own)
-
-
 def _psnr(squares: Sequence[float]) -> float:
     """PSNR of mean squares [dB], of their mean; NaN for none."""
     mean = sum(squares) / len(squares) if squares else math.nan
@@ -418,11 +383,8 @@ def write_page(folder: Path, result: Fit) -> None:
         film = packed((folder / PICTURES / f"film_{one.camera}.mp4").read_bytes())
         shown += f'<video src="data:video/mp4;base64,{film}" autoplay loop muted controls></video>'
         pictures = {
-            f"Film, fit and difference, camera {one.camera}": folder / PICTURES / f"{one.camera}.png",
-            f"Before the fit: the scene at rest, camera {one.camera}": folder / BEFORE / f"rest_{one.camera}.png",
-            f"Before the fit: points that are followed, camera {one.camera}": folder
-            / BEFORE
-            / f"tracks_{one.camera}.png",
+            f"Before the fit: {title}, camera {one.camera}": folder / BEFORE / f"{name}_{one.camera}.png"
+            for name, title in (("rest", "the scene at rest"), ("tracks", "points that are followed"))
         }
         for title, path in pictures.items():
             if path.exists():

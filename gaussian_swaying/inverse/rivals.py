@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
 from gaussian_swaying.inverse.unknowns import Unknown, Values, turn, values_at
 from gaussian_swaying.simulation.model import Model, flow_of
@@ -39,23 +40,22 @@ def rivals_of(model: Model, unknowns: Sequence[Unknown], place: Sequence[float])
     return found + last
 
 
-def bent_alike(unknowns: Sequence[Unknown], place: Sequence[float]) -> list[list[float]]:
-    r"""Places over the range of ``material.E``, in winds that bend the object as far; none if they are not sought.
+def bent_alike(unknowns: Sequence[Unknown], place: Tensor) -> Tensor:
+    r"""Places (P, U) over the range of ``material.E``, in winds that bend the object as far; none if not sought.
 
     The bend grows as :math:`w^2 / E`. A place that is several times too stiff and too windy bends as far, but swings
     too fast. The cost has a minimum there, and others on the way to the true one.
     """
     names = [unknown.name for unknown in unknowns]
     if not {"material.E", "wind.speed"} <= set(names):
-        return []
+        return place[:0, None]
     k, j = names.index("material.E"), names.index("wind.speed")
-    stiffness, wind, found = unknowns[k], unknowns[j], []
-    for step in range(SCANNED):
-        other = list(place)
-        other[k] = (step + 0.5) / SCANNED
-        speed = wind.value(place[j]) * math.sqrt(stiffness.value(other[k]) / stiffness.value(place[k]))
+    stiffness, wind, found = unknowns[k], unknowns[j], place.repeat(SCANNED, 1)
+    found[:, k] = (torch.arange(SCANNED) + 0.5) / SCANNED
+    bent = wind.value(float(place[j])) / math.sqrt(stiffness.value(float(place[k])))
+    for other in found:
+        speed = bent * math.sqrt(stiffness.value(float(other[k])))
         other[j] = wind.share(min(max(speed, wind.low), wind.high))
-        found.append(other)
     return found
 
 

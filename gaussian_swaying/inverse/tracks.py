@@ -6,7 +6,6 @@ does not return to where it came from.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -26,25 +25,16 @@ WINDOW, WIDE = 15, 960
 """Side of the square that is followed, where the longer side of the picture has at most ``WIDE`` [pixels]."""
 
 
-AROUND = 6.0
-"""Border around the windows in which Gaussians are drawn to see how they overlap, in their standard deviations."""
-
 LARGE = 2.0
 """Standard deviations of Gaussians that are left out, per the side of a window."""
 
-MANY = 1000
-"""Windows that are averaged at a time, so that memory does not grow with the picture."""
-
-_DRAWN = 1e-3
-"""Least sum of the weights of a Gaussian in a picture with which it counts as visible [pixels]."""
-
 
 def drawn_beside(painter: Painter, gaussians: DeformedGaussians, camera: Camera, places: Tensor) -> Tensor:
-    """Return the offset between the rendered and the projected centres of Gaussians, averaged over windows.
+    """Return the offset between what is rendered and the projected centres of its Gaussians, averaged over windows.
 
-    The rendered centre of a Gaussian is the mean of all pixels, weighted by its share of each after alpha compositing.
-    These weights are the derivatives of the picture by the colours. Gaussians larger than windows, as those of a sky,
-    have no place in them, and are left out.
+    A picture whose colours are the projected centres shows in each pixel the mean centre of the Gaussians that are seen
+    there, weighted by their share after alpha compositing. The offset of a pixel is its own place minus this.
+    Gaussians larger than windows, as those of a sky, are left out.
 
     Args:
         painter: Draws the picture.
@@ -55,54 +45,27 @@ def drawn_beside(painter: Painter, gaussians: DeformedGaussians, camera: Camera,
     Returns:
         Rendered minus projected centre [pixels], float64, shape (T, 2).
     """
-    if not len(places):
-        return torch.zeros(0, 2, dtype=torch.float64)
-    opacity, whole = painter.opacity().detach(), (camera.width, camera.height)
+    side, middle = window_of(camera.width, camera.height), torch.tensor([0.5 * camera.width, 0.5 * camera.height])
     pixel, depth = project(gaussians.means, camera)
     wide = gaussians.covariances.diagonal(dim1=-2, dim2=-1).amax(-1).sqrt().to(depth)
-    size = wide * float(camera.intrinsics[0, 0]) / depth.clamp(min=camera.near)
-    small = size < LARGE * window_of(*whole)
-    outer = windows(torch.stack([places.amin(0), places.amax(0)]), *whole)
-    low, high = (torch.stack([end(side) for side in outer]).to(pixel) for end in (torch.min, torch.max))
-    near = size[small & (depth > camera.near) & ((pixel >= low) & (pixel <= high)).all(-1)]
-    border = math.ceil(AROUND * float(near.kthvalue(math.ceil(0.95 * len(near))).values)) if len(near) else 0
-    left, top = (int(end) - border for end in low)  # the windows and what is around them, also beyond the picture
-    width, height = (int(end) + border + 1 - begin for end, begin in zip(high, (left, top), strict=True))
-    lens = camera.intrinsics.clone()
-    lens[:2, 2] -= lens.new_tensor([left, top])
-    camera = replace(camera, intrinsics=lens, width=width, height=height)
-
-    def drawn(colours: Tensor) -> Tensor:
-        return painter.renderer(gaussians.means, gaussians.covariances, opacity, colours, camera).color
-
-    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    middle = torch.tensor([0.5 * width, 0.5 * height])
-    asked = torch.stack([torch.ones(height, width), x - middle[0], y - middle[1]], -1).to(opacity)
-    colours = torch.zeros(len(opacity), 3, device=opacity.device, requires_grad=True)
-    with torch.enable_grad():
-        (sums,) = torch.autograd.grad(drawn(colours), colours, asked)
-    weight, centre = sums[:, :1], (project(gaussians.means, camera)[0] - middle).to(sums)
-    counts = (weight > _DRAWN) & small.to(weight.device)[:, None]
-    shift = torch.where(counts, sums[:, 1:] / weight - centre, 0.0)
+    counts = (wide * float(camera.intrinsics[0, 0]) < LARGE * side * depth) & (depth > camera.near)
+    centres = torch.cat([pixel - middle.to(pixel), torch.ones_like(pixel[:, :1])], 1)
+    opacity = painter.opacity().detach()
+    colours = torch.where(counts[:, None], centres, 0.0).to(opacity)
     with torch.no_grad():
-        field = drawn(torch.cat([shift, counts.to(shift)], 1)).cpu().double()
-    parts = (windows(some, *whole) for some in places.split(MANY))
-    found = torch.cat([field[row - top, column - left].mean(1) for column, row in parts])
-    return found[:, :2] / found[:, 2:].clamp(min=1e-6)
+        drawn = painter.renderer(gaussians.means, gaussians.covariances, opacity, colours, camera).color.cpu().double()
+    y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
+    mean, weight = drawn.split([2, 1], -1)
+    sums = torch.cat([weight * (torch.stack([x, y], -1) - middle) - mean, weight], -1).permute(2, 0, 1)
+    averaged = torch.nn.functional.avg_pool2d(sums[None], side, 1, side // 2)[0]
+    column, row = (part.clamp(0, most - 1) for part, most in zip(places.long().T, averaged.shape[:0:-1], strict=True))
+    off, weight = averaged[:, row, column].mT.split([2, 1], -1)
+    return off / weight.clamp(min=1e-6)
 
 
 def window_of(width: int, height: int) -> int:
     """Side of the square that is followed in a picture of this size [pixels]; odd."""
     return 2 * round(WINDOW // 2 * max(1.0, max(width, height) / WIDE)) + 1
-
-
-def windows(places: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Columns and rows of the pixels in the window around each place (T, 2), clamped to the picture; shape (T, W²)."""
-    side = window_of(width, height)
-    reach = torch.arange(side) - side // 2
-    beside = torch.cartesian_prod(reach, reach)
-    column, row = (places.long()[:, None] + beside).unbind(-1)
-    return column.clamp(0, width - 1), row.clamp(0, height - 1)
 
 
 LEVELS = 3
@@ -363,8 +326,10 @@ def _in_sight(pixel: Tensor, depth: Tensor, picture: RenderOutput, behind: float
 def _inside(pixel: Tensor, picture: RenderOutput, there: Tensor) -> Tensor:
     """Mask of the points ``there`` whose window contains no border of the object; all of them if hardly any is left."""
     alpha = picture.alpha[..., 0].cpu()
-    column, row = windows(pixel, alpha.shape[1], alpha.shape[0])
-    inside = there & (alpha[row, column] >= 0.5).all(-1)
+    side = window_of(alpha.shape[1], alpha.shape[0])
+    least = -torch.nn.functional.max_pool2d(-alpha[None], side, 1, side // 2)[0]
+    column, row = torch.where(there[:, None], pixel, 0.0).long().unbind(-1)
+    inside = there & (least[row, column] >= 0.5)
     return inside if int(inside.sum()) >= THIN * int(there.sum()) else there
 
 
@@ -379,8 +344,6 @@ def opencv() -> Any:
         import cv2
     except ImportError as error:
         raise ImportError(
-            "Tracks, matches and registration need OpenCV: pip install 'gaussian-swaying[fit]', or leave tracks and "
-            "matches out of `stages`.",
-            name="cv2",
+            "A fit and a registration need OpenCV: pip install 'gaussian-swaying[fit]'.", name="cv2"
         ) from error
     return cv2

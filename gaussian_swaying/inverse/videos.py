@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._inputs import check_regular
-from gaussian_swaying.captures.images import PosedImage, image_head, load_image, read_mask, remapped
+from gaussian_swaying.captures.images import PosedImage, image_head, load_image, remapped
 from gaussian_swaying.captures.lens import Lens
 from gaussian_swaying.captures.photos import clean_name, is_turned
 from gaussian_swaying.captures.transforms import check_rigid, lens_of_transforms, read_transforms, transforms_files
@@ -52,14 +52,12 @@ class Footage:
         times: Time of each frame since the motion began [s], ascending.
         cameras: The camera of each frame; the same one for a tripod.
         images: Frames, dtype uint8, shape (F, H, W, 3).
-        masks: Opacity of the object in each frame, dtype uint8, shape (F, H, W); None if it is not known.
     """
 
     name: str
     times: tuple[float, ...]
     cameras: tuple[Camera, ...]
     images: Tensor
-    masks: Tensor | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -77,7 +75,6 @@ class _Shot:
     time: float
     camera: Camera
     image: Tensor
-    mask: Tensor | None
 
 
 class _Room:
@@ -185,10 +182,8 @@ def _footage(name: str, shots: list[_Shot], begin: float) -> Footage:
         raise ValueError(f"The frames of camera {name!r} have different sizes: {sorted(sizes)}; make them equal.")
     if len(shots) < 3:
         raise ValueError(f"The camera {name!r} has {len(shots)} frames: a motion needs three or more.")
-    masks = [shot.mask for shot in shots]
-    known = None if any(mask is None for mask in masks) else torch.stack([mask for mask in masks if mask is not None])
     images = torch.stack([shot.image for shot in shots])
-    return Footage(name, tuple(times), tuple(shot.camera for shot in shots), images, known)
+    return Footage(name, tuple(times), tuple(shot.camera for shot in shots), images)
 
 
 def _read(path: Path) -> dict[str, list[_Part]]:
@@ -237,15 +232,10 @@ def _camera_name(where: str, index: int, frame: dict[str, Any]) -> str:
 
 def _picture(item: PosedImage, time: float, room: _Room) -> list[_Shot]:
     room.take(item.path, item.lens.width, item.lens.height)
-    lens = item.lens.undistorted()
-    camera = room.camera(item.world_to_camera, lens)
+    camera = room.camera(item.world_to_camera, item.lens.undistorted())
     turned = is_turned(*image_head(item.path), (item.lens.width, item.lens.height))
     pixels = load_image(item.path, item.lens, turned=bool(turned))
-    mask = pixels[..., 3].clone() if pixels.shape[-1] == 4 else None
-    if item.mask is not None:
-        found = read_mask(item.mask, item.path, item.lens)[..., None]
-        mask = (remapped(found, item.lens) if item.lens.distorted else found)[..., 0].clone()
-    return [_Shot(time, camera, pixels[..., :3].contiguous(), mask)]
+    return [_Shot(time, camera, pixels[..., :3].contiguous())]
 
 
 def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float, room: _Room) -> list[_Shot]:
@@ -277,7 +267,7 @@ def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float
             picture = torch.frombuffer(bytearray(frame), dtype=torch.uint8).reshape(size[1], size[0], 3)
             if lens.distorted:
                 picture = remapped(picture, lens)
-            shots.append(_Shot(begin + len(shots) / rate, camera, picture, None))
+            shots.append(_Shot(begin + len(shots) / rate, camera, picture))
     if not shots and 0 < head["duration"] <= (begun or 0):
         raise ValueError(
             f"The field `frames[{index}].begin` of the camera file {where} is {begun:g} s, behind the end of the film "

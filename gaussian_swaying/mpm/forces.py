@@ -52,7 +52,7 @@ class Force(Component, nn.Module):
     live_as, live = "forces.*", live_numbers()
 
     def forward(self, state: State) -> Given:
-        """The force at the start of a substep: that of the nearest device function of the class and its bases.
+        """Compute the force at the start of a substep; by default by the device function of the class.
 
         Args:
             state: The state at that time.
@@ -90,7 +90,7 @@ class Force(Component, nn.Module):
         return lambda state, k: self(state)
 
     def on_sites(self, site: Tensor, count: int) -> Force | None:
-        """The same force on groups of points that move as one, as the ``modes`` formulation asks; None if it has none.
+        """Return the force on groups of points that move as one, for the ``modes`` formulation; None if there is none.
 
         Args:
             site: The group of each point, shape (..., P).

@@ -616,8 +616,8 @@ class Frame:
     """A frame of a simulation.
 
     Attributes:
-        painter: Draws the scene.
-        editor: Has changed it.
+        painter: The painter that draws it.
+        editor: The editor whose edits it shows.
         index: Number of the frame; 0 is the frame at rest.
         state: The state at its end.
         health: Energies, momenta, stretch and other measurements.

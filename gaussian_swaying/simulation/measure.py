@@ -28,7 +28,7 @@ _SAMPLE = 4096  # particles whose nearest neighbour is searched
 
 
 class SimulationDiverged(RuntimeError):  # noqa: N818  (it ends a run the way StopIteration ends a loop)
-    """The simulation diverged: its numbers no longer mean anything.
+    """The simulation diverged: a value is NaN, infinite or absurdly large.
 
     Attributes:
         time: Simulated time [s].

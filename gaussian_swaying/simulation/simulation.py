@@ -397,7 +397,7 @@ class Simulation(Fixed):
 
     @in_turn
     def adopt(self, model: Model) -> None:
-        """As :meth:`change`, with a model."""
+        """Continue with another model of the same scene, as :meth:`change` does with single numbers."""
         before, editor = self.model, self._editor
         if model.points is not before.points and editor.edits:
             raise ValueError("`edits` give the material of parts of the object: change it there, not everywhere.")
@@ -468,7 +468,7 @@ class Simulation(Fixed):
 
     @property
     def config(self) -> str:
-        """The resume key of a run as YAML: the configuration file, the arguments given in Python, and what changed."""
+        """The complete configuration as YAML, with arguments from Python and later changes; runs resume by it."""
         given, heading = dict(self._given), "changed_in_python" if self._text else "made_in_python"
         for name, (part, marks) in self._running().items():
             first = self._first[name][1]

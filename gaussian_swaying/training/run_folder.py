@@ -50,6 +50,8 @@ class RunFolder(Callback):
             trainer.strategy.barrier()
         if self.loggers:
             trainer.loggers = default_loggers(root)
+            for logger in trainer.loggers:
+                _ = logger.experiment  # before the configuration lies in its folder, which Lightning would warn of
         place = Path(trainer.log_dir or root)  # the processes agree on it
         if first:
             self.save_config(place)

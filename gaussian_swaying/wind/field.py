@@ -347,7 +347,7 @@ class WindField(Fixed, nn.Module):
 
     @staticmethod
     def together(winds: Sequence[nn.Module]) -> WindField | None:
-        """Uniform winds of the same kind, one for each scene of a batch, as one; None if they cannot be.
+        """Combine uniform winds of the same kind, one for each scene of a batch; None if they cannot be combined.
 
         A list of winds does the same, but the host then goes through all of them before every rollout. Their numbers
         are copied: later changes of the winds have no effect.
@@ -372,7 +372,7 @@ class WindField(Fixed, nn.Module):
         return changed(_with_buffers(fields[0], times=times, flows=flows, seed=seeds), modulations=FixedList(parts))
 
     def with_seeds(self, seeds: Sequence[int]) -> WindField | list[WindField]:
-        """The same wind with other gusts for each of several scenes; as one wind if it can be."""
+        """Return the wind with a seed of its own for each scene of a batch, combined into one wind where possible."""
         if self._known:
             return _with_buffers(self, seed=_seeds(seeds, self.times))
         return [changed(self, seed=seed) for seed in seeds]

@@ -433,7 +433,7 @@ class AeroForce(Fixed, nn.Module):
 
     @property
     def mostly_linear(self) -> bool:
-        """True if less than 5 % of the force depends on the side of the patch that the flow meets."""
+        """True if reversing the normal changes the force by less than 5 %."""
         drag, friction, lift = (float(c.detach()) for c in (self.C_D, self.C_F, self.C_L.abs()))
         sided = lift / max(drag + friction + lift, 1e-30)
         return self.law in ("projected", "linear") and sided < 0.05
@@ -457,7 +457,7 @@ class AeroForce(Fixed, nn.Module):
         return self.air_density * coefficient * area * speed / mass
 
     def resistance(self, wind: Tensor, velocity: Tensor, area: Tensor) -> Tensor | None:
-        r"""Decrease of the force per velocity that the patch gains [kg/s], for ``MPMSolver.step(drag=...)``.
+        r"""Decrease of the force per unit of velocity that the patch gains [kg/s], for ``MPMSolver.step(drag=...)``.
 
         :math:`D = \tfrac12 \rho A C v_r`, so that the force at the end of the step is about :math:`f - D (v^+ - v)`. If
         the velocity does not change, this is the explicit force. A free patch never overtakes the wind. With the
@@ -744,7 +744,7 @@ class WindForce(Force):
         return [effect for effect in wind.effects if isinstance(effect, Shelter)]
 
     def foreseen(self, state: State) -> WindForce:
-        """The same force as it will be in the frame that starts with a state; this one does not change.
+        """Return a copy of the force for the frame that starts with a state; this one does not change.
 
         Shelters of the result have tables of their own, as this one may be in use on another stream.
         """

@@ -26,8 +26,8 @@ def _file(path, **fields):
         ({"unknowns": {"wind.sped": [1, 2]}}, "`wind.sped` cannot be sought"),
         ({"unknowns": {"wind.speed": {"range": [1, 2], "start": 3}}}, "`unknowns.wind.speed.start` within its range"),
         ({"known": {"material.EE": 3}}, "material.E"),
-        ({"stages": ["traks"]}, "'traks'"),
-        ({"fit_share": 0}, "`fit_share` above 0"),
+        ({"assumed": ["weight"]}, "'weight'"),
+        ({"stages": ["tracks"]}, "`fit.stages` is gone"),
         ({"search": -1}, "`search`"),
         ({"steps": 3}, "unknown field `steps`"),
         ({}, "video does not exist"),
@@ -39,12 +39,10 @@ def test_bad_input(fields, words, tmp_path, monkeypatch, capsys):
     refused(main, ["--config", file], capsys, words, folder=tmp_path)
 
 
-@pytest.mark.parametrize("stage", ["tracks", "matches"])
-def test_without_opencv(stage, tmp_path, monkeypatch, capsys):
-    """Before the videos are read; the other stages need no extra."""
+def test_without_opencv(tmp_path, monkeypatch, capsys):
+    """Before the videos are read."""
     monkeypatch.setitem(sys.modules, "cv2", None)
-    for stages, words in (([stage], "pip install 'gaussian-swaying[fit]'"), (["pixels"], "video does not exist")):
-        refused(main, ["--config", _file(tmp_path / "fit.yaml", stages=stages)], capsys, words)
+    refused(main, ["--config", _file(tmp_path / "fit.yaml")], capsys, "pip install 'gaussian-swaying[fit]'")
 
 
 def test_the_shipped_fit_is_a_plan():

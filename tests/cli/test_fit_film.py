@@ -152,7 +152,7 @@ def test_a_fit_without_a_length_keeps_the_edited_file(case, checked, capsys):
     assert "nobody measured" in capsys.readouterr().out
     assert (checked / "fit.1.yaml").read_text() == edited
     plan = yaml.safe_load((checked / "fit.yaml").read_text())
-    plan |= {"search": 0, "stages": ["tracks"], "iterations": 1, "until": 0.4}
+    plan |= {"search": 0, "iterations": 1, "until": 0.4}
     plan["known"] |= {"solver.dx": 0.06}
     (checked / "small.yaml").write_text(yaml.safe_dump(plan))
     assert main(["--config", str(checked / "small.yaml"), "--output", str(case / "result"), "--device", "cpu"]) == 0
@@ -162,7 +162,7 @@ def test_a_fit_without_a_length_keeps_the_edited_file(case, checked, capsys):
     assert "sees the wind blow to the" in told
     page = (case / "result/page.html").read_text()
     assert page.count("data:video/mp4;base64,") == 1
-    assert page.count("data:image/jpeg;base64,") == 3
+    assert page.count("data:image/jpeg;base64,") == 2
     assert "wind.azimuth" in page
 
 

@@ -31,7 +31,7 @@ def test_own_data_with_noise(own, tmp_path, capsys):
     found = {row["name"]: row for row in rows(tmp_path / "fit/values.csv")}
     assert float(found["material.E"]["value"]) == values["material.E"]
     assert float(found["wind.speed"]["standard_error"]) == result.errors["wind.speed"] > 0
-    assert (tmp_path / "fit/pictures/left.png").stat().st_size > 0
+    assert (tmp_path / "fit/pictures/film_left.mp4").stat().st_size > 0
     assert json.loads((tmp_path / "fit/result.json").read_text())["not_determined"] == result.vague
     again = Simulation.from_yaml(tmp_path / "fit/scene.yaml", device="cpu")
     assert pytest.approx(values["material.E"]) == again.material.E

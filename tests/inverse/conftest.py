@@ -15,6 +15,12 @@ def simulation(own):
 
 
 @pytest.fixture
+def brief(monkeypatch):
+    """Fits end before Gaussians are matched."""
+    monkeypatch.setattr("gaussian_swaying.inverse.fit.STEPS", (("tracks", 0.25), ("tracks", 0.5), ("tracks", 1.0)))
+
+
+@pytest.fixture
 def plan_of(own):
     """The plan of a fit of unknowns with these ranges to a video of the flag."""
 

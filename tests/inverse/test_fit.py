@@ -101,8 +101,8 @@ def test_a_fit_goes_on_from_a_better_end_but_not_for_ever(fit_of, better, rounds
     assert course.rounds == len(asked) - 1 == rounds
     assert course.rivals == asked[-1][1] == [place for place, _ in asked[:-1]]
     assert result.rivals == [{"wind.speed": 9.0}]
-    steps = [(row["stage"], row["horizon_s"]) for row in course.history]
-    again = steps[len(made.steps()) :]
+    steps = [(row["compared"], row["until"]) for row in course.history]
+    again = steps[len(module.STEPS) :]
     assert again == [("matches", made.fitted[-1])] * 2 * rounds
     assert sum(line.endswith(f"goes on from there: {made._shown([0.9])}") for line in said) == rounds
 
@@ -187,10 +187,10 @@ def test_stopped_and_continued(fit_of, tmp_path):
 
 
 @pytest.mark.parametrize("where", ["search", "best_of", "others"])
-def test_a_fit_that_is_stopped_says_how_it_goes_on_and_does(own, tmp_path, capsys, monkeypatch, where):
+def test_a_fit_that_is_stopped_says_how_it_goes_on_and_does(own, tmp_path, capsys, monkeypatch, where, brief):
     """Also in the search, before the first step, and at the end."""
     plan = {"base": str(own / "base.yaml"), "videos": str(own / "video"), "unknowns": {"wind.speed": [2.0, 12.0]}}
-    small = {"search": 3, "starts": 1, "iterations": 1, "tracks": 40, "stages": ["tracks"], "until": 0.2}
+    small = {"search": 3, "iterations": 1, "tracks": 40, "until": 0.2}
     (tmp_path / "fit.yaml").write_text(yaml.safe_dump(plan | small))
     words = ["--config", str(tmp_path / "fit.yaml"), "--output", str(tmp_path / "fit"), "--device", "cpu"]
 
@@ -209,8 +209,8 @@ def test_a_fit_that_is_stopped_says_how_it_goes_on_and_does(own, tmp_path, capsy
     assert ("] search: wind.speed" in again.err) == (where != "others")
 
 
-def test_what_a_fit_takes_is_said_before_it_starts_and_then_what_is_left(fitted, capsys):
-    fitted(SPEED, search=4, iterations=1, stages=["tracks"], tracks=40, progress=True)
+def test_what_a_fit_takes_is_said_before_it_starts_and_then_what_is_left(fitted, capsys, brief):
+    fitted(SPEED, search=4, iterations=1, tracks=40, progress=True)
     told = capsys.readouterr().err
     for words in ("simulations of 0.208 s: some ", "search:", "frame/s]"):
         assert words in told
@@ -218,7 +218,7 @@ def test_what_a_fit_takes_is_said_before_it_starts_and_then_what_is_left(fitted,
     assert "coarser grid" not in told
 
 
-def test_the_time_of_a_fit_is_that_of_all_of_it(fitted, monkeypatch):
+def test_the_time_of_a_fit_is_that_of_all_of_it(fitted, monkeypatch, brief):
     """By a clock on which films take 1000 s to prepare, and 1000 s to compare with the result."""
     late, now = [0.0], time.monotonic
     monkeypatch.setattr("gaussian_swaying.inverse.fit.time.monotonic", lambda: now() + late[0])
@@ -234,7 +234,7 @@ def test_the_time_of_a_fit_is_that_of_all_of_it(fitted, monkeypatch):
 
     slow("prepared")
     slow("predictions")
-    result = fitted(SPEED, search=0, iterations=1, stages=["tracks"], tracks=40)
+    result = fitted(SPEED, search=0, iterations=1, tracks=40)
     assert result.seconds > 2000.0
 
 
@@ -243,8 +243,8 @@ def test_a_coarser_grid_is_proposed_where_a_fit_takes_long(fit_of, monkeypatch):
     assert fit_of(SPEED).expected().endswith("less than half of it on a coarser grid (`known: {solver.dx: 0.13}`)")
 
 
-def test_resume_needs_the_same_plan(plan_of, tmp_path):
-    plan = plan_of(SPEED, tracks=40, stages=["tracks"], search=0, iterations=1)
+def test_resume_needs_the_same_plan(plan_of, tmp_path, brief):
+    plan = plan_of(SPEED, tracks=40, search=0, iterations=1)
     with value_error("nothing to resume"):
         run_fit(plan, tmp_path / "fit", resume=True, device="cpu", progress=False)
     first = run_fit(plan, tmp_path / "fit", device="cpu", progress=False)
@@ -288,7 +288,7 @@ def test_another_grid_that_the_scene_refuses_is_left_out_and_said(simulation, fi
 def test_cameras_begin_together(own, fit_of):
     """Unless nothing moves until then."""
     left, right = read_videos(own / "video")
-    cut = replace(right, **{name: getattr(right, name)[5:] for name in ("times", "cameras", "images", "masks")})
+    cut = replace(right, **{name: getattr(right, name)[5:] for name in ("times", "cameras", "images")})
     with value_error(r"camera right begin at 0\.208 s.*cut all videos to the same beginning"):
         fit_of(SPEED, videos=[left, cut])
     assert fit_of(SPEED | {"film.start": [0.25, 0.5]}, videos=[left, cut]).videos

@@ -6,7 +6,7 @@ import pytest
 import torch
 from small_films import changed
 
-from gaussian_swaying.inverse.evidence import NOISE, PictureEvidence, TrackEvidence, compare, distrust, trusted
+from gaussian_swaying.inverse.evidence import NOISE, Evidence, compare, distrust, trusted
 from gaussian_swaying.inverse.tracks import track
 from gaussian_swaying.inverse.videos import read_videos
 
@@ -16,17 +16,16 @@ pytest.importorskip("cv2", reason="needs the extra [fit]")
 @pytest.fixture
 def left(own, simulation):
     (video, _) = read_videos(own / "video")
-    return TrackEvidence(simulation, video, track(simulation, video, 40), weighed=True)
+    return Evidence(simulation, video, track(simulation, video, 40))
 
 
 def test_points_count_by_how_far_another_grid_moves_them(own, simulation, left):
     """By 1 / sqrt(1 + d^2 / n^2), with the distance d in each coordinate; at rest they count as before."""
     finer = changed(own, solver={"dx": 0.08})
-    times, pictures = left.video.times[:7], PictureEvidence(left.video, masks=False)
-    (part, same) = trusted(simulation, [finer], [left, pictures], {}, times)
-    assert same is pictures
+    times = left.video.times[:7]
+    (part,) = trusted(simulation, [finer], [left], {}, times)
     compared = {"own": (simulation, left), "other": (finer, left.on(finer)), "less": (simulation, part)}
-    values = {name: compare(scene, [e], [{}], times, moving=True)[0].values[0] for name, (scene, e) in compared.items()}
+    values = {name: compare(scene, [e], [{}], times, moving=True).values[0] for name, (scene, e) in compared.items()}
     weight = left._weight[left.tracks.seen[0]]
     weights = torch.cat([left._weight[seen] for seen in left.tracks.seen[:7]])
     away = ((values["other"] - values["own"]) / weights).norm(dim=-1)
@@ -44,7 +43,7 @@ def test_a_grid_on_which_the_scene_diverges_says_nothing(simulation, left, monke
 
     def lost(*given):
         calls.append(given)
-        return {key: torch.nan * own if len(calls) == 2 else own for key, own in pixels(*given).items()}
+        return [(*key, torch.nan * own if len(calls) == 2 else own) for *key, own in pixels(*given)]
 
     monkeypatch.setattr(grids, "_pixels", lost)
     (part,) = trusted(simulation, [simulation, simulation], [left], {}, left.video.times[:3])
@@ -58,5 +57,6 @@ def test_less_trust_is_no_better_fit(left):
     trust[2] = 0.5
     seen = left.tracks.seen[:4]
     expected = 2 * math.log(2) * int(seen[2].sum()) / int(seen.sum())
-    assert distrust([left.trusting(trust), PictureEvidence(left.video, masks=False)], times) == pytest.approx(expected)
     assert distrust([left], times) == 0.0
+    left.trust = trust
+    assert distrust([left], times) == pytest.approx(expected)

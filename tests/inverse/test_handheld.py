@@ -11,7 +11,7 @@ from shared import double, longest, value_error
 from small_films import TRUTH
 
 from gaussian_swaying.inverse.fit import fit
-from gaussian_swaying.inverse.hand import Background, follow_camera, moves_by, prepared, smooth, stands_still
+from gaussian_swaying.inverse.hand import Background, follow_camera, moves_by, prepared, stands_still
 from gaussian_swaying.inverse.tracks import still_until, track
 from gaussian_swaying.inverse.videos import Footage, read_videos
 from gaussian_swaying.rendering.cameras.camera import project
@@ -100,18 +100,6 @@ def test_a_film_without_background_is_refused(folder, simulation):
         follow_camera(replace(video, images=images), Background(simulation))
 
 
-def test_noise_is_smoothed_and_a_shake_is_not():
-    generator = np.random.default_rng(0)
-    time = np.arange(90) / 30
-    errors = np.full(90, 0.01)
-    slow = 0.2 * np.sin(2 * np.pi * 0.5 * time)
-    tremor = slow + 0.1 * np.sin(2 * np.pi * 9 * time)
-    noise = 0.01 * generator.standard_normal(90)
-    assert np.abs(smooth(slow + noise, errors) - slow).std() < 0.5 * noise.std()
-    assert np.abs(smooth(tremor + noise, errors) - tremor).std() < 1.1 * noise.std()
-    assert np.array_equal(smooth(noise[:3], errors[:3]), noise[:3])
-
-
 def test_a_still_object_is_still_in_a_film_from_a_hand(folder, simulation):
     (video,) = read_videos(folder / "hand")
     video = replace(video, images=video.images.clone())
@@ -132,7 +120,7 @@ def test_the_wind_is_found_as_from_a_tripod(folder, simulation, tmp_path):
 
     def fitted(film, **settings):
         output = tmp_path / (film + "".join(settings))
-        options = {"device": "cpu", "search": 8, "starts": 1, "progress": False}
+        options = {"device": "cpu", "search": 8, "progress": False}
         options["known"] = {"material.E": TRUTH["material.E"]}
         return fit(folder / "base.yaml", folder / film, SOUGHT, output, **options, **settings)
 

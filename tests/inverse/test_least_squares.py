@@ -15,23 +15,22 @@ from gaussian_swaying.inverse.least_squares import (
     _beside,
     cost_of,
     linearised,
-    scales_of,
+    scale_of,
     solve,
 )
 from gaussian_swaying.inverse.unknowns import Unknown, check_apart, condition, directions
 
 TIME = torch.linspace(0, 1, 60, dtype=torch.float64)
-FLOORS = {"tracks": 1e-6}
 
 
 def scaled(sigma):
     """Standard deviations that stay."""
-    return lambda blocks: {"tracks": sigma}
+    return lambda block: sigma
 
 
-def estimated(blocks):
+def estimated(block):
     """Those of the residuals."""
-    return scales_of(blocks, FLOORS)
+    return scale_of(block, 1e-6)
 
 
 def _decay(truth, noise):
@@ -44,11 +43,11 @@ def _decay(truth, noise):
 
     data = curve(double(truth)) + noise
     cluster = torch.arange(len(TIME)) // 4
-    return lambda places: [Block("tracks", curve(places.double()) - data, cluster)]
+    return lambda places: Block(curve(places.double()) - data, cluster)
 
 
 def _solved(residuals, start, rescale=estimated, most=60):
-    return solve(residuals, rescale, double(start), most, closely=True)
+    return solve(residuals, double(start), most, closely=True, scale=rescale)
 
 
 def test_outliers_count_little():
@@ -75,7 +74,7 @@ def test_standard_errors_are_the_scatter_of_repeated_fits():
         residuals = _decay([0.4, 0.3], noise)
         place = _solved(residuals, [0.5, 0.4]).place
         places.append(place)
-        errors.append(linearised(residuals, estimated, place).covariance().diagonal().sqrt())
+        errors.append(linearised(residuals, place, estimated).covariance().diagonal().sqrt())
     scatter, told = torch.stack(places).std(0), torch.stack(errors).square().mean(0).sqrt()
     assert (told / scatter).tolist() == pytest.approx([1.0, 1.0], abs=0.3)
 
@@ -99,20 +98,20 @@ def test_sensitivities_are_exact_to_second_order_and_stay_in_the_range():
     def squares(places):
         assert ((places >= 0) & (places <= 1)).all()
         weighed = places.square() * torch.tensor([1.0, 3.0])
-        return [Block("tracks", weighed[:, None], torch.zeros(1, dtype=torch.long))]
+        return Block(weighed[:, None], torch.zeros(1, dtype=torch.long))
 
-    normal = linearised(squares, scaled(1.0), double([0.5, 0.25]))
+    normal = linearised(squares, double([0.5, 0.25]), scaled(1.0))
     assert normal.matrix.diagonal().tolist() == pytest.approx([1.0, 1.5**2])
     assert normal.gradient.tolist() == pytest.approx([0.25 * 1.0, 0.1875 * 1.5])
     assert _beside(double([0.0, 1.0]))[1].min() > 0
-    linearised(squares, scaled(1.0), double([0.0, 1.0]))
+    linearised(squares, double([0.0, 1.0]), scaled(1.0))
 
 
 def valley(places):
     """Along the valley y = 0.9 x**2 the residuals change by a thirtieth of what they change across it."""
     x, y = places.T
     values = torch.stack([x - 0.7, 30 * (y - 0.9 * x.square())], -1)[:, :, None]
-    return [Block("tracks", values, torch.arange(2))]
+    return Block(values, torch.arange(2))
 
 
 def test_the_lowest_place_of_a_narrow_valley_is_found():
@@ -127,9 +126,9 @@ def test_a_rough_valley_ends():
         x, y = places.T
         wave = 0.1 / (2 * torch.pi) * torch.sin(2 * torch.pi * x / 0.05)
         values = torch.stack([x - 0.9 + wave, 30 * (y - 0.9 * x.square())], -1)[:, :, None]
-        return [Block("tracks", values, torch.arange(2))]
+        return Block(values, torch.arange(2))
 
-    found = solve(rough, scaled(0.1), double([0.3, 0.081]), 40)
+    found = solve(rough, double([0.3, 0.081]), 40, scale=scaled(0.1))
     assert found.ended
     assert found.steps < 25
 
@@ -148,7 +147,7 @@ def test_a_wind_across_a_sheet_is_found_in_few_steps():
     def curved(places):
         off = double([components(place) for place in places]) - torch.tensor(wanted)
         values = torch.stack([20 * off @ across, 0.5 * off @ along], -1)
-        return [Block("tracks", values[:, :, None], torch.arange(2))]
+        return Block(values[:, :, None], torch.arange(2))
 
     found = _solved(curved, [0.55, 0.45], scaled(1.0))
     assert found.steps < 30
@@ -160,7 +159,7 @@ def test_no_first_step_is_longer_than_its_reach():
 
     def line(places):
         tried.append(places.clone())
-        return [Block("tracks", 10 * (places - 0.95)[:, :, None], torch.arange(2))]
+        return Block(10 * (places - 0.95)[:, :, None], torch.arange(2))
 
     _solved(line, [0.1, 0.2], scaled(1.0))
     first = next(places for places in tried[1:] if len(places) == 1)
@@ -168,9 +167,9 @@ def test_no_first_step_is_longer_than_its_reach():
 
 
 def test_steps_are_counted_and_run_out():
-    found = solve(valley, scaled(0.1), double([0.3, 0.081]), 2)
+    found = solve(valley, double([0.3, 0.081]), 2, scale=scaled(0.1))
     assert (found.steps, found.ended) == (2, "")
-    again = solve(valley, scaled(0.1), double([0.7, 0.441]), 9, closely=True)
+    again = solve(valley, double([0.7, 0.441]), 9, True, scaled(0.1))
     assert again.ended
     assert float((again.place - double([0.7, 0.441])).abs().max()) < CLOSELY[0]
 
@@ -180,7 +179,7 @@ def test_where_nothing_is_better_the_place_stays():
 
     def lying(places):
         values = places if len(places) > 1 else (places - 0.5).abs() + 0.5
-        return [Block("tracks", values[:, :, None], torch.zeros(1, dtype=torch.long))]
+        return Block(values[:, :, None], torch.zeros(1, dtype=torch.long))
 
     found = _solved(lying, [0.5], scaled(1.0))
     assert found.ended == NO_STEP
@@ -192,10 +191,10 @@ def test_a_variant_that_diverges_is_no_end():
 
     def lost(places):
         values = torch.where(places < 0.6, places - 0.55, torch.nan)
-        return [Block("tracks", values[:, :, None], torch.zeros(1, dtype=torch.long))]
+        return Block(values[:, :, None], torch.zeros(1, dtype=torch.long))
 
     assert float(_solved(lost, [0.1], scaled(1.0)).place) == pytest.approx(0.55, abs=1e-3)
-    for work in (lambda: _solved(lost, [0.7], scaled(1.0)), lambda: linearised(lost, scaled(1.0), double([0.7]))):
+    for work in (lambda: _solved(lost, [0.7], scaled(1.0)), lambda: linearised(lost, double([0.7]), scaled(1.0))):
         with pytest.raises(DivergedError, match="Every simulation of a step diverged"):
             work()
 
@@ -204,9 +203,9 @@ def _mean(values, cluster, sigma, moment=None):
     """The covariance of an unknown that is added to each value."""
 
     def at(places):
-        return [Block("tracks", (values.flatten() + places - 0.5)[..., None], cluster, moment)]
+        return Block((values.flatten() + places - 0.5)[..., None], cluster, moment)
 
-    return linearised(at, scaled(sigma), double([0.5])).covariance()
+    return linearised(at, double([0.5]), scaled(sigma)).covariance()
 
 
 @pytest.mark.parametrize("clusters", [1, 2, 5])
@@ -237,10 +236,17 @@ def test_the_cost_is_hubers_function():
     """Against torch's, on both sides of 1.345 standard deviations."""
     sigma = 0.5
     values = double([[0.1, -0.6, 0.67, -0.68, 2.0], [0.0, 1.0, -3.0, 0.5, 0.2]])
-    blocks = [Block("tracks", part[..., None], torch.zeros(part.shape[1])) for part in (values[:, :2], values[:, 2:])]
+    block = Block(values[..., None], torch.zeros(5))
     expected = torch.nn.functional.huber_loss(
         values / sigma, torch.zeros_like(values), reduction="none", delta=1.345
     ).mean(1)
-    torch.testing.assert_close(cost_of(blocks, {"tracks": sigma}), expected)
+    torch.testing.assert_close(cost_of(block, sigma), expected)
     values[1, 3] = float("nan")
-    assert cost_of(blocks, {"tracks": sigma}).tolist() == [pytest.approx(float(expected[0])), float("inf")]
+    assert cost_of(block, sigma).tolist() == [pytest.approx(float(expected[0])), float("inf")]
+
+
+def test_the_scale_is_that_of_normal_noise():
+    for count in (1, 2, 3):
+        values = 0.3 * randn(1, 4000, count, generator=seeded(0))
+        values[:, :200] = 50.0
+        assert scale_of(Block(values, torch.zeros(4000)), 0.0) == pytest.approx(0.3, rel=0.1)

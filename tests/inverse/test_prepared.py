@@ -6,7 +6,6 @@ from bench.problems.films import shaken
 from handheld_films import drift, tripod, write_base, write_film
 from shared import peak, value_error
 
-from gaussian_swaying.inverse import hand as module
 from gaussian_swaying.inverse.hand import Judged, prepared
 from gaussian_swaying.inverse.plan import read_plan
 from gaussian_swaying.inverse.videos import read_videos
@@ -56,13 +55,6 @@ def test_a_hand_is_noticed_unless_the_file_says_otherwise(folder, simulation):
     assert found.cameras is video.cameras
     (still,) = read_videos(folder / "tripod")
     assert prepared(simulation, [still], hand_held=True)[1][0].hand_held
-
-
-def test_without_opencv_nothing_changes(folder, simulation, monkeypatch):
-    monkeypatch.setattr(module, "find_spec", lambda name: None)
-    videos, lines = read_videos(folder / "hand"), []
-    assert prepared(simulation, videos, say=lines.append)[0][0] is videos[0]
-    assert lines == ["Without OpenCV nothing says whether a camera moves, or its exposure drifts."]
 
 
 def test_many_frames_without_background_make_a_fit_doubtful():

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from gaussian_swaying.inverse.report import consequences, predictions, wind_seen
+from gaussian_swaying.inverse.report import consequences, wind_seen
 from gaussian_swaying.inverse.videos import Footage
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
 
@@ -40,20 +40,3 @@ def test_what_follows_from_what_was_not_measured(simulation):
     assert "Gravity" not in consequences(["length"], {}, simulation, [0.0, 0.0, 0.0])[0]
     assert math.isclose(size, 0.4, abs_tol=0.15)
     assert consequences([], {"wind.speed": 5.0}, simulation, [0.0] * 3) == []
-
-
-def test_each_camera_has_its_own_rows(simulation):
-    """Two cameras whose frames alternate: rows that were chosen from all times could all be of one of them."""
-    (one,) = (_camera((0.3, -3.0, 0.3)),)
-    videos = []
-    for number in range(2):
-        times = tuple(0.2 * k + 0.1 * number for k in range(12))
-        cameras, images = one.cameras * 12, torch.zeros(12, 10, 20, 3, dtype=torch.uint8)
-        videos.append(Footage("ab"[number], times, cameras, images))
-    times = [0.1 * k for k in range(24)]
-    still = simulation.painter.deformed(simulation.start())
-    for shown in predictions(simulation, videos, times, 12, [still] * 24):
-        parts = [told.split(", ")[1] for told in shown.rows]
-        assert parts == ["fitted"] * parts.count("fitted") + ["predicted"] * parts.count("predicted")
-        assert parts.count("fitted") == parts.count("predicted") == 3
-        assert shown.picture.shape == (6 * 10, 3 * 20, 3)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from small_films import changed
 
-from gaussian_swaying.inverse.evidence import TrackEvidence
+from gaussian_swaying.inverse.evidence import Evidence
 from gaussian_swaying.inverse.tracks import _inside, drawn_beside, match, track, window_of
 from gaussian_swaying.inverse.variants import states_of
 from gaussian_swaying.inverse.videos import Footage, read_videos
@@ -51,6 +51,12 @@ def test_a_point_that_vanishes_is_lost():
     assert not seen[2].any()
 
 
+def _off(evidence, state, frame):
+    """How far its points that are seen in a frame are from where a state has them [pixels]."""
+    seen = evidence.tracks.seen[frame]
+    return (evidence.pixels(evidence.shown([state]), frame)[0] - evidence.tracks.position[frame])[seen]
+
+
 def test_matches_do_not_drift(own, simulation):
     """Against the truth: tracks go astray by a pixel or so, matches from a nearby simulation by a part of that."""
     videos = read_videos(own / "video")
@@ -61,8 +67,8 @@ def test_matches_do_not_drift(own, simulation):
         tracks, matches = track(simulation, video), match(simulation, video, near)
         off = {}
         for name, found in (("tracks", tracks), ("matches", matches)):
-            evidence = TrackEvidence(simulation, video, found)
-            parts = [evidence.beside(evidence.shown(simulation, [truth[k]]), k)[0][0] for k in range(4, len(times))]
+            evidence = Evidence(simulation, video, found)
+            parts = [_off(evidence, truth[k], k) for k in range(4, len(times))]
             off[name] = float(torch.cat(parts).norm(dim=-1).median())
         assert off["matches"] < 0.25
         assert off["matches"] < off["tracks"] < 2
@@ -79,9 +85,9 @@ def test_a_shift_that_is_there_at_rest_is_taken_off_matches(own, simulation):
     times = video.times[:5]
     states = [found[0] for found in states_of(simulation, [{}], times)]
     video = replace(video, cameras=tuple(turned))
-    evidence = TrackEvidence(simulation, video, match(simulation, video, states))
+    evidence = Evidence(simulation, video, match(simulation, video, states))
     for k in range(len(times)):  # the simulation is the truth
-        off = evidence.beside(evidence.shown(simulation, [states[k]]), k)[0][0].median(0).values
+        off = _off(evidence, states[k], k).median(0).values
         assert off.tolist() == pytest.approx([0.0, 0.0], abs=0.05)
 
 

@@ -21,7 +21,6 @@ def test_two_cameras(own):
     left, right = read_videos(own / "video")
     assert (left.name, right.name) == ("left", "right")
     assert left.images.shape == (FRAMES, 120, 200, 3)
-    assert left.masks.shape == (FRAMES, 120, 200)
     assert left.size == (200, 120)
     assert frame_times([left, right]) == pytest.approx([k / 24 for k in range(FRAMES)], abs=1e-6)
     wanted = cameras()["left"]
@@ -31,7 +30,7 @@ def test_two_cameras(own):
 
 def test_a_video_file(own, tmp_path):
     given = json.loads((own / "video/transforms.json").read_text())
-    entry = {name: value for name, value in given["frames"][0].items() if name not in ("file_path", "mask_path")}
+    entry = {name: value for name, value in given["frames"][0].items() if name != "file_path"}
     pictures = np.stack([iio.imread(own / f"video/left_{k:04d}.png") for k in range(FRAMES)])
     iio.imwrite(tmp_path / "left.mp4", np.pad(pictures, ((0, 0), (0, 8), (0, 8), (0, 0))), fps=24)
     entry |= {"video_path": "left.mp4", "w": 208, "h": 128, "time": 2.0}
@@ -47,7 +46,6 @@ def test_a_lens_with_distortion_and_pictures_beside_a_film(own, tmp_path):
     given = json.loads((own / "video/transforms.json").read_text())["frames"]
     stills = [frame | {"k1": 0.2} for frame in given if frame["camera"] == "left"]
     for frame in stills:
-        frame.pop("mask_path", None)
         pixels = np.pad(iio.imread(own / "video" / frame["file_path"])[..., :3], ((0, 8), (0, 8), (0, 0)))
         iio.imwrite(tmp_path / frame["file_path"], pixels)
     names = [tmp_path / frame["file_path"] for frame in stills]
@@ -63,20 +61,6 @@ def test_a_lens_with_distortion_and_pictures_beside_a_film(own, tmp_path):
     assert torch.equal(filmed.cameras[0].intrinsics, taken.cameras[0].intrinsics)
     assert torch.equal(filmed.cameras[0].world_to_camera, taken.cameras[0].world_to_camera)
     assert (filmed.images.float() - taken.images.float()).abs().mean() < 6
-
-
-def test_a_mask_is_undistorted_as_its_frame(own, tmp_path):
-    shutil.copytree(own / "video", tmp_path, dirs_exist_ok=True)
-    frames = json.loads((own / "video/transforms.json").read_text())["frames"]
-    for frame in frames:
-        iio.imwrite(tmp_path / frame["mask_path"], iio.imread(tmp_path / frame["file_path"])[..., 1])
-    (tmp_path / "transforms.json").write_text(json.dumps({"k1": 0.2, "frames": frames}))
-    for video in read_videos(tmp_path):
-        assert video.size != (200, 120)
-        assert torch.equal(video.masks, video.images[..., 1])
-    iio.imwrite(tmp_path / frames[0]["mask_path"], np.zeros((120, 190), np.uint8))
-    with value_error(r"mask .* has 190 x 120 pixels, but its photo .* has 200 x 120"):
-        read_videos(tmp_path)
 
 
 def test_bad_videos(own, tmp_path):

@@ -135,7 +135,7 @@ class CaptureDataModule(LightningDataModule):
         initial_scale: Their standard deviation as a multiple of the distance to their neighbours, 0.001 to 100; 0.1
             suits MCMC.
         other_views: For losses that compare two views: how many others of each are used, see
-            :func:`~gaussian_swaying.captures.neighbours.neighbouring_views`.
+            :func:`~gaussian_swaying.captures.capture.neighbouring_views`.
         other_view_angle: Largest angle between the optical axes of the two [degrees].
 
     Raises:

@@ -19,7 +19,7 @@ from gaussian_swaying.simulation.simulation import Simulation
 def write_video(
     simulation: Simulation, folder: Path, cameras: Mapping[str, Camera], frames: int, noise: float = 0.0, seed: int = 0
 ) -> None:
-    """Simulate, and write what each camera sees: PNG files with silhouettes, and ``transforms.json``."""
+    """Simulate, and write what each camera sees: PNG files, and ``transforms.json``."""
     import imageio.v3 as iio
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -34,11 +34,9 @@ def write_video(
             colour = colour + noise * torch.randn(colour.shape, generator=generator)
             stem = f"{name}_{frame.index:04d}"
             iio.imwrite(folder / f"{stem}.png", _bytes(colour))
-            iio.imwrite(folder / f"{stem}_mask.png", _bytes(255 * picture.alpha.cpu()).repeat(3, axis=-1))
             entries.append(
                 {
                     "file_path": f"{stem}.png",
-                    "mask_path": f"{stem}_mask.png",
                     "camera": name,
                     "time": frame.index * simulation.frame_dt,
                     "transform_matrix": opengl(camera).tolist(),
