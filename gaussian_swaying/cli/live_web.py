@@ -47,17 +47,13 @@ def export_live_web(arguments: Sequence[str]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         settings = settings_of(parser, scene, further, Path(folder))
         settings.device = "cpu"
-        notes = []
-        if settings.contact is not None:
-            settings.contact = None
-            notes.append("the page has no `contact` of the material with itself: layers may pass through each other.")
         if options.target is None:
             simulation = Simulation.from_settings(parser, settings)
         else:
             simulation, sentence = fitted(parser, settings, options.target)
             print(sentence)
     film = write_live_web(simulation, scene_name(settings), target)
-    for note in (*notes, *film.notes):
+    for note in film.notes:
         print(f"note: {note.replace('the film', 'the page')}")
     print(f"{film.head['count']:,} Gaussians, {simulation.model.points.count:,} material points")
     print(f"wrote {target} ({target.stat().st_size / 1e6:.1f} MB)")

@@ -13,6 +13,8 @@ from torch import Tensor
 from gaussian_swaying._checks import check_vector
 from gaussian_swaying._fixed import fixed
 from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.geometry.linalg_triton import add3, axpy9, chosen, matmul, read, rotation, scale3, transpose
+from gaussian_swaying.kernels.language import tl, triton
 
 
 @fixed
@@ -53,22 +55,22 @@ class KeyedPath:
             for key in keys:
                 check_vector(name, key)
 
-    def keys(self, frame: SimFrame | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """Times [s], shape (K,), moves [m] and turns [rad], shape (K, 3), float64, in metres if a frame is given."""
-        count = len(self.times)
-        times = torch.tensor(self.times, dtype=torch.float64)
-        moves, turns = (_vectors(keys, count) for keys in (self.moves, self.turns))
+    def keys(self, frame: SimFrame | None = None) -> Tensor:
+        """What :func:`pose` reads [s, m, rad], float64, shape (K + 1, 7); in metres if a frame is given."""
+        times = torch.tensor(self.times, dtype=torch.float64)[:, None]
+        moves, turns = (_vectors(keys, len(times)) for keys in (self.moves, self.turns))
         turns = torch.deg2rad(turns)
         if frame is not None:
             moves = frame.direction_to_sim(moves) * frame.metres_per_unit
             turns = frame.direction_to_sim(turns)
-        return times, moves.clone(), turns.clone()
+        rows = torch.cat([times, moves, turns], 1)
+        return torch.cat([rows, rows[-1:] + torch.eye(1, 7, dtype=torch.float64)])
 
     @property
     def speed(self) -> float:
         """Largest speed of the moves [scene units/s]."""
-        times, moves, _ = self.keys()
-        return fastest(times, moves)
+        keys = self.keys()
+        return fastest(keys[:, 0], keys[:, 1:4])
 
 
 def _vectors(keys: Sequence[Sequence[float]], count: int) -> Tensor:
@@ -84,6 +86,12 @@ def fastest(times: Tensor, values: Tensor, start: float = -math.inf, end: float 
     return float(torch.where(meets, rate, 0.0).amax())
 
 
+def keys_before(keys: Tensor, time: Tensor) -> Tensor:
+    """The number of the key before each time, or of the first, in the shape of the times."""
+    found = torch.searchsorted(keys[:-1, 0].contiguous(), time.reshape(-1), right=True) - 1
+    return found.clamp(min=0).reshape(time.shape)
+
+
 def picked(values: Tensor, index: Tensor) -> Tensor:
     """Rows of a tensor (N, ...) by integers of any shape, also of none, without making the host wait.
 
@@ -92,13 +100,46 @@ def picked(values: Tensor, index: Tensor) -> Tensor:
     return values.index_select(0, index.reshape(-1)).reshape((*index.shape, *values.shape[1:]))
 
 
-def between(times: Tensor, values: Tensor, time: Tensor) -> Tensor:
-    """Values (K, 3) at times (...), linear between the keys and constant before and after, shape (..., 3)."""
-    if len(times) == 1:
-        return values[0].expand(*time.shape, 3)
-    time = time.to(times)
-    last = (torch.searchsorted(times, time.reshape(-1), right=True) - 1).clamp(0, len(times) - 2).reshape(time.shape)
-    start, end = picked(times, last), picked(times, last + 1)
-    f = ((time - start) / (end - start)).clamp(0.0, 1.0)[..., None]
-    low = picked(values, last)
-    return low + f * (picked(values, last + 1) - low)
+@triton.jit
+def pose(keys, k, t):
+    """Displacement and rotation, twelve numbers, at times t from the k-th key on, linear to the next one.
+
+    ``keys`` has rows of the time, the displacement and the turn; the last is followed by a later one that is the same.
+    """
+    key = keys + 7 * k
+    start = tl.load(key)
+    share = tl.minimum(tl.maximum((t - start) / (tl.load(key + 7) - start), 0.0), 1.0)
+    move = add3(read(key, 1, 3), share, add3(read(key, 8, 3), -1.0, read(key, 1, 3)))
+    turn = add3(read(key, 4, 3), share, add3(read(key, 11, 3), -1.0, read(key, 4, 3)))
+    return move + rotation(turn)
+
+
+@triton.jit
+def rigid_motion(keys, k, later, t, dt, centre):
+    """Centre and rotation at times t, and the velocity of what is at an offset: a matrix times it, and a vector.
+
+    It takes each place to where it is ``dt`` later; k and ``later`` are the keys before both times.
+    """
+    here = pose(keys, k, t)
+    there = pose(keys, later, t + dt)
+    turn = matmul(chosen(there, 3, 9), transpose(chosen(here, 3, 9)))
+    one = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    speed = add3(chosen(there, 0, 3), -1.0, chosen(here, 0, 3))
+    return add3(centre, 1.0, here) + chosen(here, 3, 9) + axpy9(1 / dt, turn, -1 / dt, one) + scale3(1 / dt, speed)
+
+
+@triton.jit(do_not_specialize=("count", "steps"))
+def rigid_motions(keys, count, centre, time, dt, out, steps, BLOCK: tl.constexpr):
+    """:func:`rigid_motion` at the start of some substeps, a row of 32 each."""
+    n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    step = tl.load(dt)
+    t = tl.load(time) + step * n
+    k = n * 0
+    later = n * 0
+    for j in range(1, count):
+        key = tl.load(keys + 7 * j)
+        k += (t >= key).to(tl.int32)
+        later += (t + step >= key).to(tl.int32)
+    found = rigid_motion(keys, k, later, t, step, read(centre, 0, 3))
+    for c in tl.static_range(24):
+        tl.store(out + n * 32 + c, found[c], n < steps)

@@ -123,6 +123,23 @@ def cross3(a, b):
 
 
 @triton.jit
+def rotation(turn):
+    """The rotation by an axis times angle [rad]."""
+    x, y, z = turn
+    square = x * x + y * y + z * z
+    angle = tl.sqrt(tl.maximum(square, 1e-12))
+    sine = tl.sin(angle) / angle
+    half = tl.sin(0.5 * angle) / angle
+    cosine = 2.0 * half * half  # (1 - cos a) / a²
+    cut = 1.0 - cosine * square
+    return (
+        cut + cosine * x * x, cosine * x * y - sine * z, cosine * x * z + sine * y,
+        cosine * x * y + sine * z, cut + cosine * y * y, cosine * y * z - sine * x,
+        cosine * x * z - sine * y, cosine * y * z + sine * x, cut + cosine * z * z,
+    )  # fmt: skip
+
+
+@triton.jit
 def scale3(s, a):
     """S a."""
     return s * a[0], s * a[1], s * a[2]

@@ -2,8 +2,7 @@
 
 The distance from a solid is one device function (:mod:`~gaussian_swaying.geometry.distance`), which torch runs on
 tensors and the kernels call. The numbers of each solid begin with its gap, its friction and the place of its centre
-(3). One that moves has :data:`POSE` numbers of each substep: place of the centre (3), rotation (9), and the velocity of
-what is at an offset from the centre: a matrix (9) and the velocity of the centre (3).
+(3). One that moves has :data:`POSE` numbers of each substep: those of ``keyed_path.rigid_motion``, and zeros.
 """
 
 from __future__ import annotations
@@ -20,17 +19,19 @@ from gaussian_swaying._checks import check_choice, check_positive, check_vector
 from gaussian_swaying._fixed import FixedList, assign, changed
 from gaussian_swaying.geometry.distance import DistanceGrid, distance_at, half_space_distance
 from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.geometry.keyed_path import KeyedPath, between, fastest
+from gaussian_swaying.geometry.keyed_path import KeyedPath, fastest, keys_before, rigid_motion, rigid_motions
+from gaussian_swaying.geometry.linalg import vectors
 from gaussian_swaying.geometry.linalg_triton import add3, dot3, matvec, read, transpose
 from gaussian_swaying.geometry.regions import Box, HalfSpace, Region
 from gaussian_swaying.geometry.rotations import rotation_of
-from gaussian_swaying.kernels.derive import on_tensors
+from gaussian_swaying.kernels.derive import Memory, on_tensors
 from gaussian_swaying.kernels.language import tl, triton
+from gaussian_swaying.kernels.launch import lanes, launch, replaces
 from gaussian_swaying.mpm.boundary import Boundary, Nodes
 from gaussian_swaying.mpm.device_functions import DeviceFunction, Numbers
 
 KINDS = ("sticky", "slip", "separate")
-POSE = tl.constexpr(24)
+POSE = tl.constexpr(32)
 
 
 @triton.jit
@@ -253,13 +254,10 @@ class Obstacle(Boundary):
         self.shape, self.friction, self.gap, self.path = shape, float(friction), float(gap), path
         self.rotation = check_vector("rotation", rotation)
         self.register_buffer("center", torch.tensor(shape.middle or (0.0, 0.0, 0.0), dtype=torch.float64))
-        times, moves, turns = KeyedPath([0.0]).keys() if path is None else path.keys()
-        for name, value in (("times", times), ("shifts", moves), ("turns", turns), *self._solid(None).items()):
+        for name, value in {"keys": (path or KeyedPath([0.0])).keys(), **self._solid(None)}.items():
             self.register_buffer(name, value)
         self.center: Tensor
-        self.times: Tensor
-        self.shifts: Tensor
-        self.turns: Tensor
+        self.keys: Tensor
         self.numbers: Tensor
         self.table: Tensor
 
@@ -276,7 +274,7 @@ class Obstacle(Boundary):
             return copy.copy(self)
         tensors = self._solid(frame)
         if self.path is not None:
-            _, tensors["shifts"], tensors["turns"] = self.path.keys(frame)
+            tensors["keys"] = self.path.keys(frame)
         return self.copy_in(frame, center=frame.point_to_sim(self.center), **tensors)
 
     def take(self, found: DistanceGrid) -> None:
@@ -298,9 +296,15 @@ class Obstacle(Boundary):
         return placed if self.still else replace(placed, per_substep=Numbers(POSE.value, self._poses))
 
     def _poses(self, time: Tensor, dt: Tensor, steps: int) -> Tensor:
-        """The numbers of :meth:`motion` at the start of some substeps, shape (steps, 24)."""
-        found = self.motion(time + dt * torch.arange(steps, device=time.device), dt)
-        return torch.cat([part.reshape(steps, -1) for part in found], 1)
+        """The numbers of :meth:`motion` at the start of some substeps, shape (steps, POSE)."""
+        if not replaces((time,), None):
+            found = self.motion(time + dt * torch.arange(steps, device=time.device), dt)
+            return torch.nn.functional.pad(torch.cat([part.reshape(steps, -1) for part in found], 1), (0, 8))
+        rows, block = time.new_zeros(steps, POSE.value), lanes(time.device, 64)
+        launch(rigid_motions, (-(-steps // block),))(
+            self.keys, len(self.keys) - 1, self.center, time, dt, rows, steps, BLOCK=block, num_warps=2
+        )
+        return rows
 
     def distance(self, place: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance from its surface and the gradient of it, at rest; in torch.
@@ -327,22 +331,19 @@ class Obstacle(Boundary):
         start, end = max(start, self.start), min(end, self.end)
         if not start < end:
             return 0.0
-        turning = fastest(self.times, self.turns, start, end)
-        return fastest(self.times, self.shifts, start, end) + (turning * farthest if turning else 0.0)
-
-    def pose(self, time: Tensor) -> tuple[Tensor, Tensor]:
-        """Its centre [m], shape (..., 3), and its rotation, shape (..., 3, 3), at times [s]; float64."""
-        return self.center + between(self.times, self.shifts, time), rotation_of(between(self.times, self.turns, time))
+        shifts, turns = (fastest(self.keys[:, 0], part, start, end) for part in self.keys[:, 1:].split(3, 1))
+        return shifts + (turns * farthest if turns else 0.0)
 
     def motion(self, time: Tensor, dt: float | Tensor) -> tuple[Tensor, ...]:
-        """Its pose, and the velocity of what is at an offset from the centre.
+        """Its centre [m] (..., 3) and rotation (..., 3, 3) at times [s], and the velocity of what is at an offset.
 
         The velocity [m/s] is a matrix (..., 3, 3) times the offset, and that of the centre (..., 3). It takes each
         place of the obstacle to where it is ``dt`` later.
         """
-        (here, turn), (there, turned) = self.pose(time), self.pose(time + dt)
-        identity = torch.eye(3, dtype=turn.dtype, device=turn.device)
-        return here, turn, (turned @ turn.mT - identity) / dt, (there - here) / dt
+        now, later = (keys_before(self.keys, moment) for moment in (time, time + dt))
+        found = vectors(on_tensors(rigid_motion)(Memory(self.keys), now, later, time, dt, self.center.unbind()))
+        here, turn, spin, speed = found.split([3, 9, 9, 3], -1)
+        return here, turn.unflatten(-1, (3, 3)), spin.unflatten(-1, (3, 3)), speed
 
     def touch(self, place: Tensor, time: Tensor, dt: float | Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Distance from the obstacle, its normal, and its velocity at places.

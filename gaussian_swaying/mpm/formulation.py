@@ -363,7 +363,7 @@ class Formulation(ABC):
             return 0.0
         time = float(state.time)
         place = state.position.detach()
-        away = [float((place - b.pose(state.time)[0].to(place)).norm(dim=-1).amax()) for b in moving]
+        away = [float((place - b.motion(state.time, 1.0)[0].to(place)).norm(dim=-1).amax()) for b in moving]
         speeds = [b.fastest(far, time, time + seconds) for b, far in zip(moving, away, strict=True)]
         return max(speeds) / self.settings.dx
 

@@ -17,6 +17,7 @@ from gaussian_swaying.geometry.linalg_triton import (
     matmul,
     matvec,
     read,
+    rotation,
     store3,
     transpose,
 )
@@ -244,19 +245,9 @@ def site_forces(
     row = 6 * (index - scene * scene_size) + 12 * scene_size * scene
     shift = load3(moved, 2, row, mask)
     speed = load3(moved, 2, row + 1, mask)
-    x, y, z = load3(moved, 2, row + 6 * scene_size, mask)
-    square = x * x + y * y + z * z
-    angle = tl.sqrt(tl.maximum(square, 1e-12))
-    sine = tl.sin(angle) / angle
-    half = tl.sin(0.5 * angle) / angle
-    cosine = 2.0 * half * half  # (1 - cos a) / a²
-    cut = 1.0 - cosine * square
-    R = (
-        cut + cosine * x * x, cosine * x * y - sine * z, cosine * x * z + sine * y,
-        cosine * x * y + sine * z, cut + cosine * y * y, cosine * y * z - sine * x,
-        cosine * x * z - sine * y, cosine * y * z + sine * x, cut + cosine * z * z,
-    )  # fmt: skip
-    bend = cross3((x, y, z), shift)
+    turn = load3(moved, 2, row + 6 * scene_size, mask)
+    R = rotation(turn)
+    bend = cross3(turn, shift)
     start = load3(rest, 1, 3 * index, mask)
     place = add3(start, 1.0, axpy3(0.5, bend, 1.0, shift))
     force, resistance = sum_of_forces(

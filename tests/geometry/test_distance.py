@@ -16,9 +16,9 @@ from gaussian_swaying.geometry.distance import (
     capsule_distance,
     distance_at,
 )
-from gaussian_swaying.geometry.keyed_path import KeyedPath, between
+from gaussian_swaying.geometry.keyed_path import KeyedPath, keys_before, pose
 from gaussian_swaying.geometry.meshes import mesh_distance, read_mesh, triangle_distance
-from gaussian_swaying.geometry.rotations import rotation_of
+from gaussian_swaying.kernels.derive import Memory, on_tensors
 
 HALF = double([0.3, 0.2, 0.5])
 EYE = torch.eye(3).double().reshape(-1)
@@ -244,13 +244,13 @@ def test_a_path_is_straight_between_its_keys():
     path = KeyedPath(
         [0.0, 1.0, 3.0], moves=[[0, 0, 0], [2, 0, 0], [2, 4, 0]], turns=[[0, 0, 0], [0, 0, 90], [0, 0, 90]]
     )
-    times, moves, turns = path.keys()
+    keys = path.keys()
     for time, move, angle in ((-1, (0, 0, 0), 0), (0.5, (1, 0, 0), 45), (2.0, (2, 2, 0), 90), (9.0, (2, 4, 0), 90)):
         now = double(time)
-        assert_close(between(times, moves, now), double(move))
-        x = rotation_of(between(times, turns, now)) @ double([1.0, 0, 0])
+        x, y, z, *turned = on_tensors(pose)(Memory(keys), keys_before(keys, now), now)
+        assert_close(torch.stack([x, y, z]), double(move))
         radians = torch.deg2rad(double(float(angle)))
-        assert_close(x[:2], torch.stack([radians.cos(), radians.sin()]))
+        assert_close(torch.stack([turned[0], turned[3]]), torch.stack([radians.cos(), radians.sin()]))
     assert path.speed == 2.0
 
 

@@ -81,8 +81,6 @@ def check(simulation: Simulation) -> None:
 def _check_boundary(boundary: Any) -> None:
     name = type(boundary).__name__
     if isinstance(boundary, Obstacle):
-        if not boundary.still:
-            raise _refused(f"the `path` of the {type(boundary.shape).__name__}", "leave it out")
         return
     if type(boundary) not in (PinnedRegion, PinnedPoints):
         raise _refused(f"the {name} in `solver.boundaries`", "take a PinnedRegion, PinnedPoints or Obstacle")

@@ -18,9 +18,15 @@ SWAYING = 3.0
 """Factor by which a substep by modes takes longer."""
 
 
+TOUCHING = 2.0
+"""The same by contact of the material with itself."""
+
+
 def load_of(simulation: Simulation) -> float:
     """Material points times substeps in a second of a simulation at rest [1/s], in those of WebAssembly."""
+    surface = simulation.scene.surface_places
     slower = SWAYING if simulation.solver.formulation == "modes" else 1.0
+    slower *= TOUCHING if surface is not None and surface.contact is not None else 1.0
     steps = simulation.solver.substeps(simulation.start(), simulation.frame_dt)
     return slower * simulation.model.points.count * steps / simulation.frame_dt
 

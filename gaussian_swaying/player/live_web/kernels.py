@@ -61,13 +61,8 @@ def pack_total(bound: Total, forces: Sequence[Force], wind: WindField) -> tuple[
         free = run.options_for(functions)
         run.begin(1, False)
         touching = run.touching
-        contact: dict[str, Any] = {}
-        lists: Passes = {}
-        if touching is not None:
-            touching.take(run.time, run.dt, 1)
-            if bound.contact is not None and bound.contact.contact is not None:
-                contact, lists = _listed(touching)
-                tables |= {"samples": touching.position, **{name: getattr(touching, name) for name in LISTED}}
+        contact, lists, more = _touched(run, touching) if touching is not None else ({}, {}, {})
+        tables |= more
         fastest = torch.zeros(2, **run.like)
         looks = _looks(run, fastest)
         passes = _substeps(run, free, held) | _seen(run, looks) | lists
@@ -185,15 +180,27 @@ def pack_modes(
     return head, arrays
 
 
-def _listed(touching: ContactRun) -> tuple[dict[str, Any], Passes]:
-    """How lists are made of the samples that may touch, and the kernels: the page sorts samples in between."""
+def _touched(run: TotalRun, touching: ContactRun) -> tuple[dict[str, Any], Passes, dict[str, Tensor]]:
+    """How lists are made of the samples that may touch, kernels and tables of it, and those of moving obstacles.
+
+    The page sorts the samples between the kernels.
+    """
+    with noted() as turn:
+        touching.take(run.time, run.dt, MOST_STEPS)
+    moving = [packed.rows for packed, (solid,) in filter(None, touching.solids) if solid.per_substep.count]
+    passes: Passes = {"turn": turn} if moving else {}
+    tables = {f"row{k}": rows for k, rows in enumerate(moving)}
+    tables |= {f"pose{k}": one.tensors[-1] for k, one in enumerate(turn)}
+    if touching.stage.contact is None:
+        return {}, passes, tables
     touching.take_room(MORE * touching.room, MORE * touching.slots)
     with noted() as made:
         touching.make_lists()
     gap = float(touching.limit) - touching.margin
     head = {"gap": gap, "least": touching.margin, "sure": SURE, "longest": LONGEST, "interval": touching.interval}
     head |= {"room": touching.room, "slots": touching.slots}
-    return head, {name: [one] for name, one in zip(("place", "cell", "list"), made, strict=True)}
+    passes |= {name: [one] for name, one in zip(("place", "cell", "list"), made, strict=True)}
+    return head, passes, tables | {"samples": touching.position, **{name: getattr(touching, name) for name in LISTED}}
 
 
 def _functions(forces: Sequence[Force]) -> list[DeviceFunction]:

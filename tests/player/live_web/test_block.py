@@ -109,24 +109,27 @@ def test_laws_forces_and_boundaries(make, in_node, name):
     assert told[0]["substeps"] == steps
 
 
-def obstacle(shape, gap=0.0, start=0.0, friction=0.4, **options):
+def obstacle(shape, gap=0.0, start=0.0, friction=0.4, path=None, **options):
     more = {"gap": gap, "start": start, "friction": friction, "rotation": options.pop("rotation", [0.0] * 3)}
+    more |= {"path": path}
     made = {"class_path": shape, "init_args": options}
     return {"class_path": "Obstacle", "init_args": {"shape": made, **more}}
 
 
+RISE = {"times": [0.3, 0.9], "moves": [[0, 0, 0], [0, 0, 0.3]], "turns": [[0, 0, 0], [60, 0, 90]]}
 OBSTACLES = {
     "ground and ball": [
         obstacle("HalfSpace", point=[0, 0, -0.1], normal=[0, 0.1, 1]),
         obstacle("Sphere", center=[0.25, 0.15, 0.1], radius=0.1, gap=0.005),
     ],
     "box": [obstacle("Box", min=[0.2, 0.05, -0.2], max=[0.5, 0.2, 0.1], rotation=[0.0, 0.0, 20.0])],
+    "box that rises and turns": [obstacle("Box", path=RISE, min=[0.15, 0.1, -0.5], max=[0.45, 0.4, -0.3])],
     "rod, later": [obstacle("Capsule", first=[0.25, -0.3, 0.0], second=[0.25, 0.4, 0.05], radius=0.04, start=0.1)],
 }
 
 
 @pytest.mark.parametrize("name", OBSTACLES)
-def test_contact_with_what_stands_still(make, in_node, name):
+def test_contact_with_obstacles(make, in_node, name):
     """After two seconds, of whose motion the obstacles stop a part."""
     pins = {"class_path": "PinnedRegion", "init_args": {"region": SIDE}}
     simulation = make(solver={"boundaries": [pins, *OBSTACLES[name]]})
@@ -264,22 +267,8 @@ class Lift(Force):
         return state.velocity
 
 
-BALL = {"class_path": "Sphere", "init_args": {"center": [0.4, 0.4, 0.0], "radius": 0.1}}
 REFUSED = {
     "solver.formulation": {"solver": {"formulation": "updated"}},
-    "path": {
-        "solver": {
-            "boundaries": [
-                {
-                    "class_path": "Obstacle",
-                    "init_args": {
-                        "shape": BALL,
-                        "path": {"times": [0, 1], "moves": [[0, 0, 0], [0, 1, 0]]},
-                    },
-                }
-            ]
-        }
-    },
     "copies": {"copies": [{"shift": [0, 0, 0]}, {"shift": [0, 2, 0]}]},
     "edits": {"edits": [{"time": 1.0, "E": 1e4}]},
     "the Wall": {"solver": {"boundaries": [PLANE]}},

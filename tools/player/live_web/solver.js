@@ -167,6 +167,9 @@ export class Solver extends Body {
       this.substep = dt;
     }
     tables.step[0] = dt;
+    tables.clock[0] = this.time;
+    this.kernels.turn?.(); // obstacles
+    for (let k = 0; `pose${k}` in tables; k++) tables[`row${k}`].set(tables[`pose${k}`]);
     tables.material.set(this.moduli.map((x) => x * this.stiffness), points);
     tables.curving?.set(this.curving.map((x) => x * Math.sqrt(this.stiffness)));
     this.blow(Array.from({ length: steps }, (_, k) => this.time + k * dt));
