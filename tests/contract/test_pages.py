@@ -22,7 +22,7 @@ def show(chromium):
         def show(path, ready):
             page = listened(browser.new_page(viewport={"width": 480, "height": 270}))
             page.goto(path.as_uri())
-            page.wait_for_function(ready, timeout=60_000)
+            until(lambda: page.evaluate(ready))
             return page
 
         yield show
