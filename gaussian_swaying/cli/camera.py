@@ -49,13 +49,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def write_camera(options: argparse.Namespace) -> int:
     """Find the camera, write the files, and print how sure it is."""
-    import torch
     from PIL import Image
 
     from gaussian_swaying.captures.images import read_image
     from gaussian_swaying.gaussians.formats import read_gaussians
     from gaussian_swaying.inverse import registration
     from gaussian_swaying.inverse.film import open_film
+    from gaussian_swaying.inverse.pictures import side_by_side, titled
 
     if options.fov is not None and not 0 < options.fov < 180:
         raise ValueError(f"Expected `--fov` to be between 0 and 180 degrees, but got {options.fov:g}.")
@@ -63,15 +63,11 @@ def write_camera(options: argparse.Namespace) -> int:
     still = film.suffix.lower() in registration.STILLS
     frame = read_image(film)[..., :3].contiguous() if still else open_film(film, math.inf).first_frame()
     cloud = read_gaussians(options.splat, 0)
-    draw, (height, width) = registration.painter_of(cloud), frame.shape[:2]
-    start = registration.first_cameras(cloud, options.up, options.fov or registration.VIEW, width, height)
-    found = registration.find_camera(draw, frame, start, focal=options.fov is None)
+    found, picture = registration.register(frame, cloud, options.up, options.fov)
     folder = Path(options.output or Path("outputs") / "registered" / film.stem)
     folder.mkdir(parents=True, exist_ok=True)
-    shown = (draw(found.camera).color.clamp(0, 1) * 255).round().to(torch.uint8)
-    half = ((frame.float() + shown.float()) / 2).round().to(torch.uint8)
     pictures, cameras = (folder / name for name in (registration.PICTURE, registration.CAMERAS))
-    Image.fromarray(torch.cat([frame, half, shown], 1).numpy()).save(pictures)
+    Image.fromarray(titled(side_by_side(frame, picture))).save(pictures)
     write_json(cameras, registration.transforms(found.camera, os.path.relpath(film, folder), cloud.origin))
     print(
         f"{found.agreeing} of {found.matches} points agree on the camera, {found.residual:.2f} pixels off; its "

@@ -42,9 +42,6 @@ class Evidence:
     A camera that sees a surface edge-on hardly tells where its points are: residuals are multiplied by :func:`facing`.
 
     Args:
-        simulation: The simulation.
-        video: The video.
-        tracks: Its tracks.
         trust: What else each residual is multiplied by, shape (F, T); None for 1.
 
     Attributes:
@@ -94,9 +91,6 @@ def compare(
     """Simulate variants, and compare each with the videos.
 
     Args:
-        simulation: The base.
-        evidence: The comparisons to make.
-        values: The values of each variant.
         times: Times of the frames to compare [s], ascending.
         careful: Take the same substeps for all. If not, or if one of them diverges, each variant takes its own, and may
             end in NaN.

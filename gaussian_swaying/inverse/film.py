@@ -65,7 +65,6 @@ class Film:
     """A film that is read in reduced size.
 
     Attributes:
-        path: The file.
         width: Of the frames as they are read [pixels].
         height: Of them.
         full: Factor by which the film itself is larger.
@@ -131,7 +130,6 @@ class Points:
     Args:
         grey: The first frame, dtype uint8, NumPy array (H, W).
         picture: The splat, drawn from the camera of the first frame, perhaps larger.
-        camera: That camera.
 
     Attributes:
         start: All of them, of the splat first [pixels], shape (T, 2).
@@ -188,7 +186,6 @@ def begins_to_move(film: Film, picture: RenderOutput, camera: Camera) -> float |
     Args:
         film: The film; the object is at rest in its first frame.
         picture: The splat, drawn from the camera of the first frame.
-        camera: That camera.
     """
     import numpy as np
 
@@ -283,7 +280,6 @@ def moving_box(places: Tensor, moved: Tensor, cloud: GaussianCloud) -> tuple[Ten
     Args:
         places: Of points that the film shows, shape (T, 3).
         moved: How far each goes [pixels], shape (T,).
-        cloud: The splat.
 
     Returns:
         Lower and upper corner [scene units], shape (3,); None if most of what is seen moves, or hardly anything.

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from copy import copy
 from dataclasses import dataclass, field, replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +57,7 @@ from gaussian_swaying.inverse.report import (
     write_page,
     write_results,
 )
-from gaussian_swaying.inverse.rivals import bent_alike, is_mirrored, rivals_of
+from gaussian_swaying.inverse.rivals import is_mirrored, mirrored_place
 from gaussian_swaying.inverse.tracks import Tracks, beside_rest, match, opencv, still_until, track
 from gaussian_swaying.inverse.unknowns import (
     FILM_START,
@@ -75,9 +76,8 @@ from gaussian_swaying.runs.folder import MARKER, claim_folder, hold_folder
 from gaussian_swaying.simulation.measure import duration
 from gaussian_swaying.simulation.simulation import Simulation
 
-PROGRESS, VALUES, RESULT, SCENE = "fit.json", "values.csv", "result.json", "scene.yaml"
-PAGE = "page.html"
-OURS = (PROGRESS, PAGE, VALUES, RESULT, SCENE, PICTURES)
+PROGRESS = "fit.json"
+OURS = (PROGRESS, "page.html", "values.csv", "result.json", "scene.yaml", PICTURES)
 
 FAR, GAIN = 0.005, 0.003
 """Step, as a share of a range, and least expected relative decrease of the cost by it, above which the values have not
@@ -178,7 +178,6 @@ class Course:
         rounds: How often it went on from another end.
         tried: Steps that the solve of the last step has tried.
         ended: The reason why it ended; empty if it did not.
-        history: One row for each step.
         seconds: Time spent.
     """
 
@@ -282,22 +281,21 @@ class Problem:
         That is the one from whose pictures the most Gaussians are found in the first frames. One simulation of each
         shows all starts.
         """
-        column, known = self.sought[FILM_START], self.begins
+        known = self.begins
         assert known is not None
         before = torch.linspace(max(0.0, -known.high), -known.low, BEGINS, dtype=torch.float64).tolist()
         brief = [replace(video, images=video.images[:1]) for video in self.videos]
         values = [{name: v for name, v in self.values(place).items() if name != FILM_START} for place in places]
-        best, most = places[0], -1
+        found: list[tuple[int, list[float]]] = []
         with self.say.work("where the film begins", len(before) * len(places)):
             for ago, states in zip(before, states_of(self.simulation, values, before, alike=False), strict=True):
                 self.say.tick(len(places))
-                for place, state in zip(places, states[: None if ago else 1], strict=False):  # at rest all are alike
+                for place, state in zip(places.tolist(), states[: None if ago else 1], strict=False):  # rest is alike
                     shown = self.simulation.painter.deformed(state)
                     tracks = [track(self.simulation, video, self.plan.tracks, shown) for video in brief]
-                    if (found := sum(int(own.seen[0].sum()) for own in tracks)) > most:
-                        most, best = found, place.clone()
-                        best[column] = known.share(-ago)
-        return [float(share) for share in best]
+                    place[self.sought[FILM_START]] = known.share(-ago)
+                    found.append((sum(int(own.seen[0].sum()) for own in tracks), place))
+        return max(found, key=itemgetter(0))[1]
 
     def evidence(self, kind: str, matched: Sequence[float] = ()) -> list[Evidence]:
         """What each video shows: ``tracks``, or ``matches`` that are made at a place."""
@@ -358,8 +356,7 @@ class Problem:
         """Return the best starts of a coarse search: Sobol's sequence over the ranges, then draws around the best.
 
         Coefficients and damping stay in the middle of their ranges, and what has a ``start`` stays there, but for
-        :data:`SPREAD`. Then other stiffnesses are tried that bend as far as the best. Values that were given are the
-        first start. Simulations of similar stiffness are one batch.
+        :data:`SPREAD`. Values that were given are the first start. Simulations of similar stiffness are one batch.
         """
         unknowns, plan = self.plan.unknowns, self.plan
         begin = torch.tensor([[0.5 if u.start is None else u.share(u.start) for u in unknowns]], dtype=torch.float64)
@@ -377,19 +374,14 @@ class Problem:
         shape = plan.search - 3 * plan.search // 4, len(free)
         shift = NEAR * torch.randn(shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
-        def near(best: Tensor) -> Tensor:
-            found = best.repeat(len(shift), 1)
-            found[:, free] = (found[:, free] + shift).clamp(0.02, 0.98)
-            return found
-
         evidence, times = self.evidence("tracks"), self._until(SEARCHED)
-        with self.say.work("search", (given + plan.search + 16) * len(times)):
+        with self.say.work("search", (given + plan.search) * len(times)):
             places, costs = self._coarse(torch.cat([begin[: int(given)], places]), evidence, times)
-            for others in (lambda best: bent_alike(unknowns, best), near):
-                other = others(places[int(costs.argmin())])
-                if len(other):
-                    tried = self._coarse(other, evidence, times)
-                    places, costs = torch.cat([places, tried[0]]), torch.cat([costs, tried[1]])
+            if len(shift):
+                near = places[int(costs.argmin())].repeat(len(shift), 1)
+                near[:, free] = (near[:, free] + shift).clamp(0.02, 0.98)
+                near, more = self._coarse(near, evidence, times)
+                places, costs = torch.cat([places, near]), torch.cat([costs, more])
         if not bool(torch.isfinite(costs).any()):
             raise DivergedError("Every simulation of the coarse search diverged: narrow the ranges of `unknowns`.")
         found = places[:1].tolist() if given else []
@@ -423,18 +415,17 @@ class Problem:
 
         Horizons grow, and at each the worse half is left.
         """
-        if len(places) < 2:
-            return [list(place) for place in places]
+        ended, costs, left = [list(place) for place in places], [0.0], len(places)
+        if left < 2:
+            return ended
         evidence = self.evidence("tracks")
-        kept, left = [list(place) for place in places], len(places)
         for share in (share for kind, share in STEPS if kind == "tracks"):
             times = self._until(share)
-            ended, costs = self._brief(kept, evidence, times)
+            ended, costs = self._brief(ended[:left], evidence, times)
             for place, cost in zip(ended, costs, strict=True):
                 self.say(f"start to {times[-1]:.3g} s: cost {cost:.3g}, {self._shown(place)}")
             left = (left + 1) // 2
-            kept = ended[:left]
-        return kept[:1] + [place for place, cost in zip(ended[1:], costs[1:], strict=True) if cost < 2 * costs[0]][:1]
+        return ended[: 1 + sum(cost < 2 * costs[0] for cost in costs[1:2])]
 
     def _brief(
         self, places: Sequence[Sequence[float]], evidence: Sequence[Evidence] | None, times: Sequence[float]
@@ -457,21 +448,22 @@ class Problem:
             raise DivergedError("Every simulation of a start diverged: narrow the ranges of `unknowns`.")
         scale = min(own.scale for own in found)
         costs = [float(cost_of(own.block, scale)[0]) + other for own, other in zip(found, more, strict=True)]
-        ends, apart = [own.place.tolist() for own in found], list[int]()
-        for k in sorted(range(len(found)), key=costs.__getitem__):
-            if all(apart_by(self.plan.unknowns, ends[k], ends[j]) > SAME for j in apart):
-                apart.append(k)
-        return [ends[k] for k in apart], [costs[k] for k in apart]
+        ends: list[list[float]] = []
+        kept: list[float] = []
+        for cost, end in sorted(zip(costs, (own.place.tolist() for own in found), strict=True)):
+            if all(apart_by(self.plan.unknowns, end, other) > SAME for other in ends):
+                ends, kept = [*ends, end], [*kept, cost]
+        return ends, kept
 
     def others(
         self, place: Sequence[float], rivals: Sequence[Sequence[float]]
     ) -> tuple[list[dict[str, float]], list[float]]:
         """Values of other ends that cost as little as the best one, and the best place if it is clearly better.
 
-        Other starts, and the rivals that are known of any fit, are tried over all fitted frames.
+        Other starts, and the mirrored wind, are tried over all fitted frames.
         """
         model, unknowns = self.simulation.model, self.plan.unknowns
-        tried = [*map(list, rivals), *rivals_of(model, unknowns, place)]
+        tried = [*map(list, rivals), *mirrored_place(model, unknowns, place)]
         if not tried:
             return [], []
         try:
@@ -482,11 +474,12 @@ class Problem:
         for end, cost in zip(ended, costs, strict=True):
             self.say(f"rival: cost {cost:.5g}, {self._shown(end)}")
         away = [apart_by(unknowns, end, place) for end in ended]
-        most = [MIRRORED if is_mirrored(model, unknowns, place, end) else RIVAL for end in ended]
-        own = away.index(min(away))
-        better = ended[0] if costs[own] > LOWER * costs[0] and away[0] > 2 * SAME else []
-        near = [k for k, cost in enumerate(costs) if cost < most[k] * costs[0] and away[k] > 2 * SAME]
-        return [self.values(ended[k]) for k in near], better
+        better = ended[0] if costs[away.index(min(away))] > LOWER * costs[0] and away[0] > 2 * SAME else []
+        near = []
+        for end, cost, far in zip(ended, costs, away, strict=True):
+            most = MIRRORED if is_mirrored(model, unknowns, place, end) else RIVAL
+            near += [self.values(end)] if cost < most * costs[0] and far > 2 * SAME else []
+        return near, better
 
     def expected(self) -> str:
         """What the fit will take, in words, from the time of one simulation; and a coarser grid if that is long."""
@@ -496,9 +489,8 @@ class Problem:
             begin = time.monotonic()
             for _ in states_of(self.simulation, [self.values(middle)] * batch, times):
                 pass
-        rivals = len(rivals_of(self.simulation.model, self.plan.unknowns, middle)) + 1
-        count = SEARCHED * (self.plan.search + 16) + 3 * batch * sum(share for _, share in STEPS)
-        count += BRIEF * batch * (STARTS + rivals) + REFINED * batch * len(GRIDS)
+        count = SEARCHED * self.plan.search + 3 * batch * sum(share for _, share in STEPS)
+        count += BRIEF * batch * (STARTS + 3) + REFINED * batch * len(GRIDS)
         seconds = count * (time.monotonic() - begin) / batch
         told = f"about {count:.0f} simulations of {self.fitted[-1]:.3g} s: some {duration(seconds)}"
         if self.simulation.device.type == "cpu" and seconds > LONG:
@@ -691,7 +683,6 @@ def run_fit(
 
     Args:
         plan: From :func:`~gaussian_swaying.inverse.plan.read_plan`.
-        output: The folder.
         resume: Continue the fit in it after its last step.
         device: ``auto``, ``cpu`` or ``cuda``.
         progress: Print a line for each step, and a bar.

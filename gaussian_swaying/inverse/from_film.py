@@ -33,17 +33,7 @@ from gaussian_swaying.inverse.fit import run_fit
 from gaussian_swaying.inverse.look import FOUND, shown_in
 from gaussian_swaying.inverse.pictures import side_by_side, titled
 from gaussian_swaying.inverse.plan import read_plan
-from gaussian_swaying.inverse.registration import (
-    CAMERAS,
-    PICTURE,
-    STILLS,
-    VIEW,
-    find_camera,
-    first_cameras,
-    fov_of,
-    painter_of,
-    transforms,
-)
+from gaussian_swaying.inverse.registration import CAMERAS, PICTURE, STILLS, fov_of, in_space, register, transforms
 from gaussian_swaying.inverse.report import Fit
 from gaussian_swaying.inverse.unknowns import FILM_START, SCALE
 from gaussian_swaying.inverse.videos import Footage, read_videos
@@ -171,11 +161,9 @@ def prepare(
     preview = suggest(splat, **wanted)
     shown, lines = _shown(seen, read_videos(folder / CAMERAS, origin=seen.cloud.origin)[0], preview, wanted)
     wanted |= shown
+    preview = suggest(splat, **wanted) if shown else preview
     if isinstance(length, tuple):
-        preview = suggest(splat, **wanted) if shown else preview
-        wanted["longest_side"] = longest_side(*length, seen, preview)
-    if shown or "longest_side" in wanted:
-        preview = suggest(splat, **wanted)
+        preview = suggest(splat, **wanted, longest_side=longest_side(*length, seen, preview))
     if length == "gravity" and not preview.falls:
         raise ValueError(
             "`--length gravity` is for a sheet alone, or for what nothing holds: anything else was captured in balance "
@@ -199,13 +187,10 @@ def registered(
     """The first frame of a film with its camera, and a sentence on that."""
     head = open_film(os.fspath(film))
     frame, cloud = head.first_frame(), read_gaussians(splat, 0)
-    draw, known = painter_of(cloud), focal or head.focal
-    fov = VIEW if known is None else view_of_focal(known, head.width, head.height)
-    start = first_cameras(cloud, up, fov, head.width, head.height)
-    found, picture = None, draw(start[0])
+    known, found = focal or head.focal, None
+    fov = None if known is None else view_of_focal(known, head.width, head.height)
     with suppress(ValueError):
-        found = find_camera(draw, frame, start, focal=known is None)
-        picture = draw(found.camera)
+        found, picture = register(frame, cloud, up, fov)
     if found is None or shown_in(picture, frame)[0] < FOUND:
         raise ValueError(
             f"The splat was not found in the first frame of {film}. It has to show the object at rest, large "
@@ -314,20 +299,18 @@ def extent(points: Tensor, up: Sequence[float]) -> float:
 
 def _place(name: str, number: int, seen: Seen) -> Tensor:
     """The place in the splat that a pixel of the first frame shows, shape (3,)."""
+    import numpy as np
+
     try:
         x, y = (float(value) / seen.film.full for value in name.split(":")[number].split(","))
     except ValueError:
         raise ValueError(f"Expected `--length` to have two places such as 120,80:120,640, but got {name}.") from None
-    column, row = int(x), int(y)
-    alpha = seen.picture.alpha[..., 0]
-    if not (0 <= column < alpha.shape[1] and 0 <= row < alpha.shape[0]) or float(alpha[row, column]) < 0.5:
+    place, known = in_space(seen.picture, seen.camera, np.array([[x, y]]))
+    if not known[0]:
         raise ValueError(
             f"The place {name.split(':')[number]} of `--length` is not on the splat: look at {PICTURE} for places."
         )
-    depth = float(seen.picture.depth[row, column, 0] / alpha[row, column])
-    K, view = seen.camera.intrinsics.double(), seen.camera.world_to_camera.double()
-    ray = torch.tensor([(x - float(K[0, 2])) / float(K[0, 0]), (y - float(K[1, 2])) / float(K[1, 1]), 1.0])
-    return view[:3, :3].T @ (depth * ray.double() - view[:3, 3])
+    return torch.from_numpy(place[0])
 
 
 def plan_text(

@@ -143,7 +143,6 @@ def follow_camera(
 
     Args:
         video: The film. Its cameras may be those of the first frame, or rough ones of all frames.
-        background: What stands still.
         tick: Called with 1 after each frame.
     """
     found: list[Registration | None] = []
@@ -199,7 +198,6 @@ def gains(video: Footage, background: Background) -> tuple[Tensor, tuple[int, ..
 
     Args:
         video: The film, with the camera of each frame.
-        background: What stands still.
 
     Returns:
         Gains of red, green and blue, float64, shape (F, 3), and the frames that show too little of the background,
@@ -225,21 +223,13 @@ def gains(video: Footage, background: Background) -> tuple[Tensor, tuple[int, ..
 def gain_of(image: Tensor, picture: Tensor, still: Tensor) -> Tensor | None:
     """The gain of each colour, float64, shape (3,), between a picture and an image of grey levels up to 255 (H, W, 3).
 
-    It is the median over squares of the mask ``still`` (H, W), weighed by their brightness in the picture, which
-    minimises the sum of distances. None if there are too few squares.
+    It is the median over squares of the mask ``still`` (H, W); None if there are too few.
     """
     inside = _averaged(still.double()[..., None])[:, 0] == 1
     seen, wanted = _averaged(image), _averaged(picture)
     cut = _averaged((torch.maximum(image, picture) >= BRIGHT).double())
     inside &= ((seen > DARK) & (wanted > DARK) & (cut == 0)).all(1)
-    if int(inside.sum()) < FEWEST_SQUARES:
-        return None
-    found = []
-    for real, drawn in zip(seen[inside].T, wanted[inside].T, strict=True):
-        order = (real / drawn).argsort()
-        total = drawn[order].cumsum(0)
-        found.append((real / drawn)[order[int(torch.searchsorted(total, 0.5 * total[-1]))]])
-    return torch.stack(found)
+    return (seen / wanted)[inside].median(0).values if int(inside.sum()) >= FEWEST_SQUARES else None
 
 
 def with_gains(images: Tensor, found: Sequence[Tensor] | Tensor) -> Tensor:
@@ -261,7 +251,6 @@ class Judged:
 
     Attributes:
         camera: Name of the camera.
-        frames: Number of its frames.
         moved: Distance that the background goes in the film of a camera that is said to stand still [pixels].
         hand_held: Whether the camera of each frame was found.
         residual: Median distance of points of the background from where these cameras see them [pixels].
@@ -311,8 +300,6 @@ def prepared(
     """Find the camera of each frame of films from a hand, and take drifts of exposure and white balance off all films.
 
     Args:
-        simulation: The scene.
-        videos: The films.
         hand_held: Whether their cameras move otherwise than they are said to. None: those whose frames all have one
             camera, but whose background moves by more than half a pixel.
         also_moves: Names of parts of the splat that move in the films, though the simulation does not move them.

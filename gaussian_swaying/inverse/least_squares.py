@@ -99,8 +99,6 @@ def solve(
     The standard deviation of the residuals is estimated anew where it ends, until it stays.
 
     Args:
-        residuals: Computes residuals.
-        place: Where to begin, shape (U,).
         most: Most steps that are tried.
         closely: Whether small steps count.
         scale: Standard deviation of the first variant's residuals.

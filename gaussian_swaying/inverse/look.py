@@ -45,6 +45,8 @@ def shown_in(picture: RenderOutput, frame: Tensor) -> tuple[float, float]:
 
 def first_look(simulation: Simulation, video: Footage) -> tuple[bool, str]:
     """Whether the first frame of a video shows the splat at all, and a sentence if its camera is another one."""
+    from scipy.spatial.transform import Rotation
+
     painter, rest, frame, given = simulation.painter, simulation.scene.rest(), video.images[0], video.cameras[0]
 
     def draw(camera: Camera) -> RenderOutput:
@@ -61,7 +63,7 @@ def first_look(simulation: Simulation, video: Footage) -> tuple[bool, str]:
     near, far = ((camera.position.double().cpu() - middle) for camera in (other, given))
     larger = float(far.norm() / near.norm())
     turn = other.world_to_camera[:3, :3].double().cpu() @ given.world_to_camera[:3, :3].double().cpu().T
-    angle = math.degrees(math.acos(min(1.0, max(-1.0, 0.5 * (float(turn.trace()) - 1)))))
+    angle = math.degrees(Rotation.from_matrix(turn.numpy()).magnitude())
     if max(larger, 1 / larger) < LARGER and angle < ASIDE:
         return True, ""
     return True, (

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaussian_swaying.inverse.tracks import Tracks
+from gaussian_swaying.inverse.tracks import Tracks, opencv
 from gaussian_swaying.inverse.videos import Footage
 from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.simulation.simulation import Simulation, classify
@@ -64,21 +64,17 @@ def _at_rest(simulation: Simulation, video: Footage) -> Any:
 def _tracks_picture(video: Footage, tracks: Tracks) -> Any:
     """The first frame, pale, with the ways of the points that are followed."""
     import numpy as np
-    from PIL import Image, ImageDraw
 
-    pale = (video.images[0].float() * 0.4 + 255 * 0.6).round().to(torch.uint8)
-    picture = Image.fromarray(pale.numpy())
-    draw = ImageDraw.Draw(picture)
-    for number in range(tracks.position.shape[1]):
-        seen = tracks.seen[:, number]
-        way = [tuple(place) for place in tracks.position[seen, number].tolist()]
+    cv2 = opencv()
+    picture = (video.images[0].float() * 0.4 + 255 * 0.6).round().to(torch.uint8).numpy()
+    for seen, way in zip(tracks.seen.T, tracks.position.transpose(0, 1), strict=True):
+        places = way[seen].numpy().astype(np.int32)
         colour = (20, 90, 220) if bool(seen[-1]) else (220, 120, 0)
-        if len(way) > 1:
-            draw.line(way, fill=colour, width=1)
-        for x, y in way[:1]:
-            draw.ellipse((x - 1.5, y - 1.5, x + 1.5, y + 1.5), fill=colour)
+        cv2.polylines(picture, [places], False, colour, 1, cv2.LINE_AA)
+        for place in places[:1]:
+            cv2.circle(picture, place.tolist(), 2, colour, cv2.FILLED, cv2.LINE_AA)
     told = f"{tracks.position.shape[1]} points followed; orange: {int((~tracks.seen[-1]).sum())} lost"
-    return titled([(told, torch.from_numpy(np.asarray(picture).copy()).float() / 255)])
+    return titled([(told, torch.from_numpy(picture).float() / 255)])
 
 
 def titled(panels: Sequence[tuple[str, Tensor]]) -> Any:

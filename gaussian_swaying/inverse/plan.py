@@ -20,6 +20,7 @@ from gaussian_swaying.simulation.simulation import Simulation
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
+LISTS = ("base", "videos", "cameras", "assumed", "also_moves")
 ASSUMED = ("length", "mass", "camera")
 """Things in a base that nobody measured, perhaps."""
 
@@ -31,7 +32,6 @@ class Plan:
     Args:
         base: Configuration files of ``sim``: the splat, the solver, and first values.
         videos: Folders with transforms.json.
-        unknowns: The unknowns.
         known: Options of ``sim`` that replace those of the base.
         until: Fit the frames up to this time [s], half of them if it is None; the rest is predicted.
         search: Number of simulations of the coarse search; 0 starts at ``start`` or in the middle of the ranges.
@@ -76,33 +76,33 @@ def read_plan(path: str | os.PathLike[str], find: Callable[[str], str] = str) ->
         find: Gives the file of a name in ``base`` that is not there.
     """
     file, names = Path(path), [entry.name for entry in fields(Plan)]
-    given = read_fields(file, "the fit file", names, partial(refuse_gone, within="fit"))
-    sought, known = given.get("unknowns"), given.get("known") or {}
+    read = read_fields(file, "the fit file", names, partial(refuse_gone, within="fit"))
+    given: dict[str, Any] = {
+        name: [value] if name in LISTS and isinstance(value, str) else value
+        for name, value in read.items()
+        if value is not None
+    }
+    sought, known = given.pop("unknowns", None), given.pop("known", {})
+    check_arguments(Plan.__init__, given | {"known": known}, str(file))
     if not isinstance(sought, dict) or not sought:
         raise ValueError(
             f"Expected `unknowns` in {file} to have entries such as wind.speed: {{range: [1, 10]}}, but got "
             f"{sought!r:.60}."
         )
-    if not isinstance(known, dict) or not all(isinstance(name, str) for name in known):
-        raise ValueError(
-            f"Expected `known` in {file} to have options of `sim` as names (material.E), but got {known!r:.60}."
-        )
-    settings = {name: given[name] for name in names[4:] if given.get(name) is not None}
-    listed = {name: _names(file, name, given.get(name)) for name in ("base", "videos")}
-    for name in ("cameras", "assumed", "also_moves"):
-        if name in settings:
-            settings[name] = _names(file, name, settings[name])
-    check_arguments(Plan.__init__, settings, str(file))
+    for name in ("base", "videos"):
+        if not given.get(name):
+            raise ValueError(f"Expected `{name}` in {file} to be a name or a list of names: add it.")
 
     def beside(value: Any) -> Any:
         there = isinstance(value, str) and (file.parent / value).exists()
         return str(file.parent / value) if there else value
 
-    base = [beside(name) if beside(name) != name else find(name) for name in listed["base"]]
+    base = [beside(name) if beside(name) != name else find(name) for name in given.pop("base")]
     import_forces(base)
-    videos = [beside(name) if Path(beside(name)).exists() else str(file.parent / name) for name in listed["videos"]]
-    known = {name: beside(value) for name, value in known.items()}
-    return Plan(base, videos, [read_unknown(name, entry) for name, entry in sought.items()], known, **settings)
+    videos = given.pop("videos")
+    videos = [beside(name) if Path(beside(name)).exists() else str(file.parent / name) for name in videos]
+    unknowns = [read_unknown(name, entry) for name, entry in sought.items()]
+    return Plan(base, videos, unknowns, {name: beside(value) for name, value in known.items()}, **given)
 
 
 def read_unknown(name: str, given: Any) -> Unknown:
@@ -133,10 +133,3 @@ def parse_base(plan: Plan, parser: ArgumentParser) -> Namespace:
     settings = parser.parse_args([*files, *(option(name, value) for name, value in plan.known.items())])
     check_settings(Simulation, settings)
     return settings
-
-
-def _names(file: Path, name: str, given: Any) -> list[str]:
-    several = [given] if isinstance(given, str) else given
-    if not isinstance(several, list) or not several or not all(isinstance(item, str) for item in several):
-        raise ValueError(f"Expected `{name}` in {file} to be a name or a list of names, but got {given!r:.60}.")
-    return several

@@ -11,12 +11,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaussian_swaying._checks import check_whole
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.gaussians.measures import Gaussians
 from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.geometry.origin import Origin
+from gaussian_swaying.geometry.rotations import rotation_of
 from gaussian_swaying.inverse.tracks import follow, opencv
 from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
 from gaussian_swaying.rendering.protocol import RenderOutput
@@ -54,7 +54,6 @@ class Registration:
     """The camera of a frame.
 
     Attributes:
-        camera: The camera.
         matches: Points that were matched at the end.
         agreeing: Those that agree on the camera.
         residual: Root mean square of their distances [pixels].
@@ -80,17 +79,28 @@ def painter_of(cloud: GaussianCloud) -> Draw:
     return draw
 
 
-def first_cameras(
-    cloud: GaussianCloud, up: Sequence[float] | None, fov: float, width: int, height: int
-) -> list[Camera]:
-    """Cameras around a splat, from which it fills the picture; ``fov`` is vertical [degrees]."""
-    splat, draw = Gaussians.of(cloud), torch.Generator().manual_seed(0)
-    up = guess_up(splat)[0].direction if up is None else up
-    chosen = cloud.means[torch.multinomial(torch.from_numpy(splat.weight), 10_000, replacement=True, generator=draw)]
-    low, high = (torch.quantile(chosen, share, dim=0) for share in (0.02, 0.98))
-    narrow = math.tan(math.radians(fov) / 2) * min(1.0, width / height)
-    distance = ROOM * 0.5 * float((high - low).norm()) / narrow
-    return cameras_around((0.5 * (low + high)).tolist(), distance, up, fov, width, height)
+def register(
+    frame: Tensor, cloud: GaussianCloud, up: Sequence[float] | None = None, fov: float | None = None
+) -> tuple[Registration, RenderOutput]:
+    """Find the camera of a frame of a splat at rest, and the picture of the splat from there.
+
+    Args:
+        frame: The frame, dtype uint8, shape (H, W, 3), without lens distortion.
+        up: Direction in the splat that is up, shape (3,); guessed if it is None.
+        fov: Vertical field of view [degrees]; found if it is None.
+
+    Raises:
+        ValueError: If the splat is not found in the frame.
+    """
+    splat, draw, generator = Gaussians.of(cloud), painter_of(cloud), torch.Generator().manual_seed(0)
+    height, width = frame.shape[:2]
+    up, view = guess_up(splat)[0].direction if up is None else up, VIEW if fov is None else fov
+    some = torch.multinomial(torch.from_numpy(splat.weight), 10_000, replacement=True, generator=generator)
+    low, high = (torch.quantile(cloud.means[some], share, dim=0) for share in (0.02, 0.98))
+    away = ROOM * 0.5 * float((high - low).norm()) / (math.tan(math.radians(view) / 2) * min(1.0, width / height))
+    around = cameras_around(0.5 * (low + high), away, up, view, width, height)
+    found = find_camera(draw, frame, around, focal=fov is None)
+    return found, draw(found.camera)
 
 
 def cameras_around(
@@ -115,16 +125,13 @@ def cameras_around(
         count: Directions around the object.
         elevations: Angles above the level [degrees].
     """
-    check_whole("count", count, 1)
     middle = torch.as_tensor(center, dtype=torch.float64)
     axis = torch.nn.functional.normalize(torch.as_tensor(up, dtype=torch.float64), dim=0)
-    across = torch.eye(3, dtype=torch.float64)[int(axis.abs().argmin())]
-    first = torch.nn.functional.normalize(torch.linalg.cross(axis, across), dim=0)
-    second = torch.linalg.cross(axis, first)
+    first = torch.linalg.cross(axis, torch.eye(3, dtype=torch.float64)[int(axis.abs().argmin())])
     found = []
     for elevation in map(math.radians, elevations):
         for turn in (2 * math.pi * k / count for k in range(count)):
-            level = math.cos(turn) * first + math.sin(turn) * second
+            level = rotation_of((turn * axis)[None])[0] @ torch.nn.functional.normalize(first, dim=0)
             eye = middle + distance * (math.cos(elevation) * level + math.sin(elevation) * axis)
             found.append(look_at_camera(eye, middle, axis, fov_y_degrees, width, height, dtype=torch.float64))
     return found
@@ -214,20 +221,16 @@ def in_space(picture: RenderOutput, camera: Camera, pixel: Any) -> tuple[Any, An
     """Places on the surface that pixels (N, 2) of a picture show, float64, and a mask of those whose depth is known."""
     import numpy as np
 
-    alpha = picture.alpha[..., 0].detach().cpu().numpy()
-    depth = (picture.depth / picture.alpha.clamp(min=1e-3))[..., 0].detach().cpu().numpy().astype(np.float64)
-    height, width = alpha.shape
-    x, y = pixel[:, 0] - 0.5, pixel[:, 1] - 0.5
-    column, row = np.clip(np.floor(x).astype(int), 0, width - 2), np.clip(np.floor(y).astype(int), 0, height - 2)
-    corners = [(row + i, column + j) for i in (0, 1) for j in (0, 1)]
-    known = np.min([alpha[corner] for corner in corners], 0) > SOLID
-    fx, fy = x - column, y - row
-    shares = ((1 - fy) * (1 - fx), (1 - fy) * fx, fy * (1 - fx), fy * fx)
-    z = sum(share * depth[corner] for share, corner in zip(shares, corners, strict=True))
-    K = camera.intrinsics.double().cpu().numpy()
-    local = np.stack([(pixel[:, 0] - K[0, 2]) / K[0, 0] * z, (pixel[:, 1] - K[1, 2]) / K[1, 1] * z, z], 1)
+    cv2, alpha = opencv(), picture.alpha[..., 0].detach().cpu().numpy()
+    depth = picture.depth[..., 0].detach().cpu().numpy() / np.maximum(alpha, 1e-3)
+    if not len(pixel):
+        return np.zeros((0, 3)), np.zeros(0, dtype=bool)
+    at = (pixel - 0.5).astype(np.float32)[None]
+    known = cv2.remap(cv2.erode(alpha, np.ones((3, 3))), at, None, cv2.INTER_NEAREST)[0] > SOLID
+    z = cv2.remap(depth, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0].astype(float)
+    ray = np.concatenate([pixel, np.ones_like(pixel[:, :1])], 1) @ np.linalg.inv(camera.intrinsics.double().numpy()).T
     view = camera.world_to_camera.double().cpu().numpy()
-    return (local - view[:3, 3]) @ view[:3, :3], known
+    return (z[:, None] * ray - view[:3, 3]) @ view[:3, :3], known
 
 
 def off_camera(world: Any, there: Any, intrinsics: Any, near: float) -> Any:

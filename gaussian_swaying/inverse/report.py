@@ -49,7 +49,6 @@ class Shown:
     """Comparison of the fitted simulation with the video of one camera.
 
     Attributes:
-        camera: Its name.
         fitted: PSNR of the fitted frames [dB].
         predicted: PSNR of the predicted frames [dB]; NaN if there are none.
         rest: PSNR of the first frame, at rest [dB]: what noise, light and the splat itself leave, before any motion.
@@ -66,13 +65,9 @@ class Fit:
     """The result of a fit.
 
     Attributes:
-        unknowns: The unknowns.
-        place: Values found, as shares of the ranges.
-        covariance: Covariance of the places, shape (U, U).
+        covariance: Covariance of the places, as shares of the ranges, shape (U, U).
         directions: Principal directions of the sensitivities, the best known first.
         shown: Comparison with the video of each camera.
-        history: One row for each step.
-        seconds: Time it took.
         unsettled: The reason why the values are not a local minimum, and a remedy; empty if they are one.
         notes: What the videos say against the plan.
         followed: For each camera, the share of the motion of its tracks in the fitted frames that the simulation
@@ -199,8 +194,6 @@ def predictions(
 
     Args:
         simulation: Draws the Gaussians.
-        videos: The videos.
-        times: Times of ``moved`` [s].
         fitted: Number of them that were fitted.
         moved: All Gaussians at each of the times.
         films: Folder for ``film_CAMERA.mp4``: the video beside the fit.
@@ -269,13 +262,11 @@ def write_results(
             "verdict": result.verdict,
             "why": [*failed, *doubtful],
             "motion_explained": dict(result.followed),
-            "notes": list(result.notes),
             "assumed": list(result.assumed),
             "background": [asdict(one) for one in result.judged],
             "not_settled": result.unsettled,
             "not_followed": result.astray,
             "not_determined": result.vague,
-            "at_an_end": result.at_an_end,
             "history": list(result.history),
             "seconds": result.seconds,
         },

@@ -37,7 +37,6 @@ def drawn_beside(painter: Painter, gaussians: DeformedGaussians, camera: Camera,
     Gaussians larger than windows, as those of a sky, are left out.
 
     Args:
-        painter: Draws the picture.
         gaussians: All Gaussians of it, N.
         camera: Its camera, on their device.
         places: Centres of the windows [pixels], shape (T, 2).
@@ -115,7 +114,6 @@ def track(simulation: Simulation, video: Footage, most: int = 400, first: Deform
 
     Args:
         simulation: The scene, at rest where the video begins.
-        video: The video.
         most: Largest number of tracks; those with the most texture are taken.
         first: What the first frame shows, about, if it is not the scene at rest. The Gaussians are followed from a
             picture of it to the first frame; those whose surroundings do not look alike there are not seen.
@@ -200,10 +198,7 @@ def match(
     Gaussians near the border are left out, as the border of a splat is not quite that of the real object.
 
     Args:
-        simulation: The scene.
-        video: The video.
         states: The state at the time of each frame of the video; fewer if only the first frames are wanted.
-        most: Largest number of Gaussians.
         moving: Whether the video begins in motion.
     """
     import numpy as np

@@ -35,8 +35,6 @@ class Unknown:
     Args:
         name: A number of :class:`~gaussian_swaying.simulation.model.Model`, such as ``material.E`` or ``wind.speed``,
             or one of :data:`OF_FILM`.
-        low: Smallest value.
-        high: Largest value.
         scale: ``log`` or ``linear``.
         start: First value; None for a coarse search over the range.
 

@@ -48,7 +48,6 @@ class Footage:
     """The video of one camera.
 
     Attributes:
-        name: Name of the camera.
         times: Time of each frame since the motion began [s], ascending.
         cameras: The camera of each frame; the same one for a tripod.
         images: Frames, dtype uint8, shape (F, H, W, 3).

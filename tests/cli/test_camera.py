@@ -44,7 +44,7 @@ def test_the_camera_of_a_picture_and_its_field_of_view(flag, capsys):
     assert _off(found) < 0.5
     assert (found.position - CAMERA.position).norm() < 0.02
     assert json.loads((flag / "out/transforms.json").read_text())["frames"][0]["file_path"] == "../first.png"
-    assert Image.open(flag / "out/registration.png").size == (3 * 320, 240)
+    assert Image.open(flag / "out/registration.png").size == (3 * 320, 240 + 22)
 
 
 def test_what_cannot_be_is_refused_and_writes_nothing(flag, capsys):

@@ -1,12 +1,10 @@
 """Unknowns: ranges, the polar form of the flow, and how values get into a variant."""
 
 import pytest
-import torch
 from shared import value_error
 from small_films import changed
 
 from gaussian_swaying.inverse.unknowns import Unknown, check_unknowns
-from gaussian_swaying.simulation.model import flow_of
 
 
 @pytest.mark.parametrize("scale", ["log", "linear"])
@@ -17,12 +15,6 @@ def test_value_and_share_are_inverse(scale):
         step = 1e-6
         slope = (unknown.value(share + step) - unknown.value(share - step)) / (2 * step)
         assert unknown.slope(share) == pytest.approx(slope, rel=1e-6)
-
-
-def test_flow_in_polar_form():
-    flow = flow_of([0.0, 0.0, 1.0], {"wind.speed": 2.0, "wind.azimuth": 30.0, "wind.elevation": 30.0})
-    assert flow == pytest.approx([1.5, 0.75**0.5, 1.0])
-    assert flow_of([3.0, 4.0, 0.0], {"wind.speed": 10.0}) == pytest.approx([6.0, 8.0, 0.0])
 
 
 @pytest.mark.parametrize(
@@ -42,14 +34,6 @@ def test_bad_ranges(name, low, high, words):
     assert name in str(error.value)
 
 
-def test_a_variant_is_the_simulation_with_these_values(simulation, tmp_path):
-    values = {"material.E": 2e4, "material.nu": 0.2, "material.density": 40.0, "material.thickness": 0.02}
-    found = simulation.model.at(values).points
-    wanted = changed(tmp_path, material={name.split(".")[1]: value for name, value in values.items()}).scene.points
-    for name in ("position", "mass", "volume", "youngs_modulus", "poisson_ratio"):
-        torch.testing.assert_close(getattr(found, name), getattr(wanted, name))
-
-
 def test_what_has_no_place_is_refused(simulation, tmp_path):
     with value_error("There is no"):
         check_unknowns(simulation, [Unknown("wind.modulations.0.amplitude", 0.0, 1.0)])
@@ -58,11 +42,3 @@ def test_what_has_no_place_is_refused(simulation, tmp_path):
     still = changed(tmp_path, wind={"flow": [0.0, 0.0, 0.0]})
     with value_error(r"no `wind.flow`"):
         check_unknowns(still, [Unknown("wind.azimuth", 0.0, 90.0)])
-
-
-def test_a_modulation(tmp_path):
-    wind = {"flow": [4.0, 0.0, 0.0], "modulations": [{"class_path": "SineSway", "init_args": {"period": 1.0}}]}
-    simulation = changed(tmp_path, wind=wind)
-    found = simulation.model.at({"wind.modulations.0.amplitude": 0.25, "wind.speed": 8.0}).wind
-    assert found(0.25).tolist() == pytest.approx([10.0, 0.0, 0.0])
-    assert simulation.wind(0.25).tolist() == pytest.approx([6.0, 0.0, 0.0])
