@@ -36,12 +36,3 @@ def until(condition, seconds=60.0):
 def reached(session, time):
     """Wait until a session has come to a time [s]."""
     until(lambda: session.snapshot.health.time > time)
-
-
-def heap_of(window):
-    """Bytes of the heap of a window after a collection."""
-    session = window.context.new_cdp_session(window)
-    for method in ("Performance.enable", "HeapProfiler.collectGarbage", "HeapProfiler.collectGarbage"):
-        session.send(method)
-    metrics = {metric["name"]: metric["value"] for metric in session.send("Performance.getMetrics")["metrics"]}
-    return metrics["JSHeapUsedSize"]
