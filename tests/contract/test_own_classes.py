@@ -49,7 +49,7 @@ def extensions(tmp_path_factory):
     folder, before = tmp_path_factory.mktemp("own"), [dict(table) for table in TABLES]
     (folder / "extensions.py").write_text("".join(_blocks("python")))
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / "examples"))
+        patch.syspath_prepend(str(ROOT / "examples/materials"))
         patch.syspath_prepend(str(folder))
         yield importlib.import_module("extensions")
     for table, old in zip(TABLES, before, strict=True):
