@@ -12,6 +12,7 @@ from bench.report import SECTIONS, grid, reached, source, table
 from bench.runner import read
 from gaussian_swaying.mpm.materials import MATERIALS
 from gaussian_swaying.simulation.model import names, number
+from gaussian_swaying.wind.field import Modulation
 
 DASH = "-"
 
@@ -40,11 +41,15 @@ SECTIONS["materials.known"] = _materials
 
 
 def _live() -> str:
+    """Without those of classes that are not the package's, which tests define."""
     kinds = {"vector": "three numbers", "whole": "a whole number"}
+    gusts = (kind.live for kind in Modulation.__subclasses__() if kind.__module__.startswith("gaussian_swaying"))
+    swaying = {f"wind.modulations.*.{field}" for live in gusts for field in live}
+    shown = [name for name in names() if name in swaying or not name.startswith(("forces.", "wind.modulations."))]
     rows = (
         f"`{name}` | {one.unit} | {kinds.get(one.kind, one.range_in_words)} | {'yes' * one.batched} "
         f"| {'yes' * one.differentiable}"
-        for name, one in ((name, number(name)) for name in names())
+        for name, one in ((name, number(name)) for name in shown)
     )
     return grid("name | unit | range | together in a batch | keeps a gradient", rows)
 

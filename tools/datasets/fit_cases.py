@@ -221,7 +221,6 @@ def fit_settings(folder: str) -> dict[str, Any]:
     return {
         "base": [f"{folder}/scene.yaml"],
         "videos": [folder],
-        "fit_share": 0.5,
         "unknowns": {
             "wind.speed": {"range": [0.5, 10.0]},
             "wind.azimuth": {"range": [-90.0, 90.0]},

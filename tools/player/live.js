@@ -1,4 +1,4 @@
-// The live page: draws the states of a simulation that runs on a server, and steers it. See docs/live.md.
+// The live page: draws the states of a simulation that runs on a server, and steers it. See docs/web.md.
 import { Brush } from "./brush.js";
 import { blocks, readHead, writeNodes } from "./bundle.js";
 import { button, element, make } from "./panel.js";
