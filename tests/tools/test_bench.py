@@ -36,16 +36,14 @@ def test_a_section_is_made_from_records(added, tmp_path, monkeypatch):
     runner.run(added, folder=tmp_path)
     monkeypatch.setattr(report, "SECTIONS", {})
     monkeypatch.setattr(report, "read", lambda name: runner.read(name, tmp_path))
-    report.table(
-        "a.halves", added, "number | half", lambda run: f"{run.number} | {run.half:.1f}", order=lambda r: -r.half
-    )
+    report.table("a.halves", added, "number | half", lambda run: f"{run.number} | {run.half:.1f}")
     page = tmp_path / "page.md"
     page.write_text("Before\n<!-- begin: a.halves -->\nold\n<!-- end -->\nAfter\n")
     assert report.report(check=True, folder=tmp_path) == ["page.md"]
     assert report.report(folder=tmp_path) == ["page.md"]
     assert report.report(check=True, folder=tmp_path) == []
     lines = page.read_text().splitlines()
-    assert lines[3:7] == ["| number | half |", "|---|---|", "| 3 | 1.5 |", "| 2 | 1.0 |"]
+    assert lines[3:7] == ["| number | half |", "|---|---|", "| 2 | 1.0 |", "| 3 | 1.5 |"]
     assert "CPU" in lines[8]
     assert "commit" in lines[8]
 

@@ -21,13 +21,12 @@ def table(
     head: str,
     row: Callable[[SimpleNamespace], str],
     where: Callable[[SimpleNamespace], bool] = lambda run: True,
-    order: Callable[[SimpleNamespace], object] | None = None,
 ) -> None:
     """Declare a table with one row for each run."""
 
     def make() -> str:
         runs = [run for run in read(records) if not hasattr(run, "failed") and where(run)]
-        return grid(head, map(row, sorted(runs, key=order) if order else runs)) + "\n\n" + source(runs)  # type: ignore[arg-type]
+        return grid(head, map(row, runs)) + "\n\n" + source(runs)
 
     SECTIONS[name] = make
 
@@ -46,11 +45,6 @@ def source(runs: list[SimpleNamespace]) -> str:
         when, which = (part[0] if len(part) == 1 else f"{part[0]} to {part[-1]}" for part in (days, commits))
         told.append(f"{device}, {when}, commit{'s' * (len(commits) > 1)} {which}.")
     return " ".join(told)
-
-
-def percent(share: float, digits: int = 1) -> str:
-    """A share in per cent."""
-    return f"{100 * share:.{digits}f} %"
 
 
 def reached(answer: bool) -> str:
