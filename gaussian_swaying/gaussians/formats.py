@@ -114,10 +114,8 @@ class Format:
 
 def _steps_of_spz(cloud: GaussianCloud, spz_version: int) -> Tensor:
     """The steps of centres in an .spz file."""
-    places = cloud.means.double().abs()
-    if spz_version > 1:
-        return torch.full_like(places[:, 0], 2.0 ** -fraction_bits(float(places.max())))
-    return places.amax(-1) * 2.0**-10
+    farthest = float(cloud.means.double().abs().max())
+    return torch.full_like(cloud.opacities, 2.0 ** -fraction_bits(farthest), dtype=torch.float64)
 
 
 def _steps_of_sog(cloud: GaussianCloud) -> Tensor:
