@@ -10,6 +10,7 @@ from gaussian_swaying.inverse.variants import states_of
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation import step
+from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.wind.field import WindField
 from gaussian_swaying.wind.force import AeroForce, WindForce
 from gaussian_swaying.wind.patches import Patches
@@ -105,3 +106,18 @@ def test_wind_on_patches_of_many_directions_in_a_batch():
         torch.testing.assert_close(one.position, alone.position)
         torch.testing.assert_close(one.work, alone.work)
         assert one.node_velocity.shape == alone.node_velocity.shape
+
+
+VALUES = [{}, {"wind.speed": 7.0}, {"material.E": 5e3}, {"aero.C_D": 0.4}]
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_batch_in_the_kernels_moves_as_in_torch(own):
+    times = [0.0, 1 / 24, 4 / 24]
+    found = {}
+    for device in ("cpu", "cuda"):
+        found[device] = list(states_of(Simulation.from_yaml(own / "base.yaml", device=device), VALUES, times))[-1]
+    for slow, fast in zip(found["cpu"], found["cuda"], strict=True):
+        moved = float(longest(slow.position.sub(fast.position.cpu())))
+        assert moved < 1e-3
