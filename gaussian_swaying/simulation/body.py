@@ -840,8 +840,8 @@ class Samples:
         return layer_distance(self.bending, self.E, self.nu, self.thickness)
 
     def choose(self, index: Tensor) -> Samples:
-        own: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
-        return Samples(**{name: value if value is None else value[index] for name, value in own.items()})
+        known = {f.name: getattr(self, f.name) for f in fields(self)}
+        return replace(self, **{name: value[index] for name, value in known.items() if value is not None})
 
     def points(
         self, layers: int, laws: Sequence[ConstitutiveLaw], dtype: torch.dtype, attached: Tensor | None = None
