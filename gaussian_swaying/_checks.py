@@ -28,8 +28,6 @@ def check_shape(name: str, tensor: Tensor, *shape: int | str | None, batches: bo
     """Check the trailing dimensions of a tensor.
 
     Args:
-        name: Name of the argument, for the message.
-        tensor: Tensor to check.
         shape: Expected trailing sizes; a letter or None stands for any size.
     """
     if not isinstance(tensor, Tensor):
@@ -148,13 +146,7 @@ def check_finite(name: str, tensor: Tensor) -> None:
 
 
 def check_like(name: str, tensor: Tensor, like: Tensor) -> None:
-    """Check that a tensor has the precision and lies on the device of the material.
-
-    Args:
-        name: Name of the argument, for the message.
-        tensor: Tensor to check.
-        like: A tensor of the material.
-    """
+    """Check that a tensor has the precision and lies on the device of the material."""
     if tensor.dtype != like.dtype:
         found, wanted = (str(dtype).removeprefix("torch.") for dtype in (tensor.dtype, like.dtype))
         raise TypeError(f"Expected `{name}` in {wanted}, as the material is, but got {found}: convert it with `.to`.")

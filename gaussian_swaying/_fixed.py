@@ -93,7 +93,6 @@ def fixed(kind: type[T]) -> type[T]:
 
 
 def _closing(name: str, method: Callable[..., None]) -> Callable[..., None]:
-    """An ``__init__`` or ``__post_init__`` after which an object is made, unless it belongs to a base of its class."""
     parameters, ours = inspect.signature(method), (method.__module__ or "").startswith("gaussian_swaying.")
 
     @wraps(method)
@@ -146,7 +145,6 @@ def _refuses(thing: Any, name: str) -> bool:
 
 
 def _check(thing: Any, name: str, *value: object) -> None:
-    """Refuse a value, unless it is there, as after an operation in place; or that the name is deleted."""
     fresh = not value or isinstance(getattr(type(thing), name, None), property)
     if _refuses(thing, name) and (fresh or getattr(thing, name, _ABSENT) is not value[0]):
         _refuse(thing, name)

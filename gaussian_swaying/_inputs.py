@@ -27,7 +27,6 @@ def check_regular(path: str | os.PathLike[str], what: str = "the file", largest:
     """Return a path if it is a regular file, and not a folder, or a device or pipe that may never end.
 
     Args:
-        what: Name of the kind of file, for the message.
         largest: Largest allowed size [bytes].
     """
     path = Path(path)
@@ -73,11 +72,7 @@ def decoded(content: bytes) -> str:
 
 
 def parse_json(content: bytes, what: str, path: str | os.PathLike[str]) -> Any:
-    """Parse JSON from a file or a part of one.
-
-    Args:
-        path: The file, for the message.
-    """
+    """Parse JSON from a file or a part of one."""
     entries = sum(map(content.count, (b",", b"[", b"{")))
     if entries > MOST_ENTRIES:
         raise ValueError(
@@ -94,11 +89,7 @@ def parse_json(content: bytes, what: str, path: str | os.PathLike[str]) -> Any:
 
 
 def check_archive(path: str | os.PathLike[str], what: str) -> Path:
-    """Return a path if it is a .npz file whose arrays take no more than a gigabyte plus ten times its size.
-
-    Args:
-        what: Name of the kind of file, for the message.
-    """
+    """Return a path if it is a .npz file whose arrays take no more than a gigabyte plus ten times its size."""
     path = check_regular(path, what)
     try:
         with zipfile.ZipFile(path) as archive:
@@ -142,7 +133,6 @@ def read_arrays(
 
     Args:
         what: Name of the kind of file, for the message, for example "the reference".
-        only: Whether others are an error.
 
     Returns:
         The arrays found, by name.

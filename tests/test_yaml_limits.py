@@ -9,7 +9,6 @@ from gaussian_swaying.cli.simulate import main
 
 
 def laughs(levels):
-    """Nine times nine times nine ..."""
     lines = ["a0: &a0 [lol, lol, lol, lol, lol, lol, lol, lol, lol]"]
     lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, levels)]
     return "\n".join(lines)

@@ -131,7 +131,6 @@ def load_image(
 
     Args:
         downscale: Each pixel of the result is the mean of a square of this many pixels on a side.
-        turned: Whether to turn the pixels as the EXIF tag says.
 
     Returns:
         Pixels, dtype uint8, shape (H, W, 3), or (H, W, 4) with colours that are multiplied with alpha. Their lens is

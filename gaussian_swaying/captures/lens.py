@@ -152,7 +152,6 @@ class Lens:
 
 @lru_cache(maxsize=1024)  # the images of a capture share a lens or have one each
 def _undistorted(lens: Lens) -> Lens:
-    """See :meth:`Lens.undistorted`."""
     focal = torch.tensor([lens.fx, lens.fy], dtype=torch.float64)
     center = torch.tensor([lens.cx, lens.cy], dtype=torch.float64)
     x = torch.linspace(0.5, lens.width - 0.5, lens.width, dtype=torch.float64)

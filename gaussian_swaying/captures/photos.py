@@ -33,9 +33,6 @@ class Photos:
         It is the file of this name, or else one whose name differs in case, spaces, Unicode form or, for photos, the
         ending, which may be missing. Of a path from another computer, the longest end that exists here counts.
 
-        Args:
-            name: Path with forward or back slashes.
-
         Raises:
             ValueError: If several files fit.
         """
@@ -57,7 +54,6 @@ class Photos:
         return exact
 
     def _index(self) -> dict[str, list[Path]]:
-        """All photos below the folder by the keys of their names, with and without the ending."""
         if self._files is None:
             self._files = {}
             for path in photos_below(self.folder):
@@ -69,7 +65,6 @@ class Photos:
 
 
 def _key(name: str, stem: bool = False) -> str:
-    """What names of the same photo have in common; that without an ending has a slash at its end."""
     if stem:
         start, end = os.path.splitext(name)
         name = (start if end.lower() in SUFFIXES else name) + "/"

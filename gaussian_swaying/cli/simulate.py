@@ -47,7 +47,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _simulate(parser: ArgumentParser, arguments: Sequence[str], started: list[Simulation]) -> None:
-    """Parse, build, run, and report the files; the simulation is put into ``started`` before it writes anything."""
     arguments = with_shipped(arguments, "sim")
     with guessing(parser):
         settings = parser.parse_args(arguments)

@@ -71,11 +71,7 @@ class PresetAction(Action):
 
 
 def build_parser(schema: type) -> ArgumentParser:
-    """The parser of ``gaussian-swaying sim``: one group of options per component, typos are errors.
-
-    Args:
-        schema: The class whose constructor defines the fields of a configuration.
-    """
+    """The parser of ``gaussian-swaying sim``: one group of options per component, typos are errors."""
     from jsonargparse import ActionYesNo
 
     limit_yaml(lambda found: with_named_materials(refuse_gone(found)))
@@ -164,7 +160,6 @@ def arguments_of(schema: type) -> list[str]:
 
 
 def _groups(schema: type) -> dict[str, type]:
-    """The arguments that are a single component each; they become groups of options."""
     hints = get_type_hints(schema.__init__)  # type: ignore[misc]
     found: dict[str, type] = {}
     for name in arguments_of(schema):

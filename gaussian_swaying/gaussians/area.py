@@ -138,7 +138,6 @@ def _open_cosine(neighbours: Tensor) -> Tensor:
 def _cells(
     offset: Tensor, distance: Tensor, normal: Tensor, disc: Tensor, discs: Tensor, phase: int
 ) -> tuple[Tensor, Tensor]:
-    """As :func:`_cell_area`, in a kernel where it can be compiled."""
     if not replaces((offset,), torch.float64):
         return _cell_area(offset, distance, normal, disc, discs, phase)
     from gaussian_swaying.gaussians.area_triton import cells

@@ -113,7 +113,6 @@ class Format:
 
 
 def _steps_of_spz(cloud: GaussianCloud, spz_version: int) -> Tensor:
-    """The steps of centres in an .spz file."""
     places = cloud.means.double().abs()
     if spz_version > 1:
         return torch.full_like(places[:, 0], 2.0 ** -fraction_bits(float(places.max())))
@@ -121,7 +120,6 @@ def _steps_of_spz(cloud: GaussianCloud, spz_version: int) -> Tensor:
 
 
 def _steps_of_sog(cloud: GaussianCloud) -> Tensor:
-    """The steps of centres in a SOG file."""
     places = cloud.means.double().abs()
     logs = cloud.means.double().sign() * places.log1p()
     return ((logs.amax(0) - logs.amin(0)) / 65535 * (1 + places)).amax(-1)
@@ -237,12 +235,10 @@ def endings(written: bool = False) -> dict[str, str]:
 
 
 def _named(path: Path, known: dict[str, str]) -> str | None:
-    """The format of a file by the ending of its name: .compressed.ply rather than .ply; None if there is none."""
     return known.get(max((ending for ending in known if path.name.lower().endswith(ending)), key=len, default=""))
 
 
 def _check_beginning(path: Path, own: Format) -> None:
-    """Raise ValueError if the content is plainly another than the name says."""
     with check_regular(path, "the splat").open("rb") as stream:
         start = stream.read(64).removeprefix(b"\xef\xbb\xbf").lstrip().lower()
     if start.startswith(_PAGES):
@@ -287,9 +283,6 @@ def cleaned(path: Path, cloud: GaussianCloud) -> GaussianCloud:
 
     What has no meaning is left out with a warning, see :func:`~gaussian_swaying.gaussians.repair.repaired`. Logits of
     opacities are clamped to ±16, where float32 ends.
-
-    Args:
-        path: The file, for messages.
 
     Returns:
         The same, or a smaller cloud, with quaternions of unit length.
@@ -369,8 +362,6 @@ def export_frames(
     Args:
         path: File to write: for USD one with all frames; otherwise its name has ``#`` in place of the digits of the
             frame, counted from 0: ``frame_####.spz`` makes frame_0000.spz, frame_0001.spz, ... Its folder is made.
-        clouds: One for each frame; read one by one.
-        fps: Frames per second, for USD.
 
     Returns:
         The files.

@@ -292,7 +292,6 @@ class _Document:
         return moved if moved is cloud else repaired(path, moved)
 
     def _check_turn(self, matrix: np.ndarray) -> None:
-        """Raise ValueError unless a transformation is a rotation, a shift and positive scales along the axes."""
         lengths = np.linalg.norm(matrix[:3, :3], axis=0)
         if not (np.isfinite(matrix).all() and lengths.all()):
             raise self.broken("the transformation of a node is singular or infinite")
@@ -341,7 +340,6 @@ class _Document:
         return np.maximum(values / np.float32(top), -1), int(top)
 
     def _buffer(self, index: int) -> np.ndarray:
-        """The bytes of a buffer: in the file itself, in a data URI, or in a file of the same folder."""
         entry = self.item("buffers", index)
         announced = self.whole(entry, "byteLength")
         if index not in self._buffers:
@@ -371,7 +369,6 @@ def _harmonics(degree: int) -> list[str]:
 
 
 def _degree(path: Path, names: dict[str, Any]) -> int:
-    """Degree of the harmonics; ValueError if one is missing."""
     if "POSITION" not in names:
         raise ValueError(f"{path} has no attribute `POSITION`, so it is not a splat; export it again.")
     degree = max((band for band in range(4) if any(f":SH_DEGREE_{band}_" in name for name in names)), default=0)

@@ -161,7 +161,6 @@ def cord_heights(splat: Gaussians, up: Array) -> tuple[float, float] | None:
 
 
 def _above(splat: Gaussians, end: Array, up: Array, margin: float) -> bool:
-    """True if the centre of the visible area is above or below the hull of one end, within a margin."""
     angles = np.arange(8) * math.pi / 8
     along = plane_axes(up) @ [np.cos(angles), np.sin(angles)]
     at = np.average(splat.means, 0, splat.weight + 1e-300) @ along
@@ -170,7 +169,6 @@ def _above(splat: Gaussians, end: Array, up: Array, margin: float) -> bool:
 
 
 def _pole_side(points: Array, across: Array) -> tuple[tuple[float, ...], bool]:
-    """Direction of the upright side of a sheet that contains the origin; if none does, one of the sides, and False."""
     across = snapped(across / np.linalg.norm(across), 10)
     across = across * np.sign(across[np.abs(across).argmax()])
     along = points @ across
@@ -220,7 +218,6 @@ def end_region(points: Array, direction: Sequence[float], cell: float) -> Region
 
     Args:
         points: Centres of the simulated Gaussians [scene units], shape (N, 3).
-        direction: Unit vector from the object to the end.
         cell: Grid spacing [scene units].
     """
     axis = np.array(direction)

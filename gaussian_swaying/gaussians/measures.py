@@ -97,9 +97,6 @@ def ranked(reasons: Mapping[str, Sequence[tuple[float, str]]]) -> tuple[str, str
     """The possibility with the most points, the next best, how sure that is, and all sums of points.
 
     A lead of 2 gives high confidence, a lead of 1 medium, and less low.
-
-    Args:
-        reasons: For each possibility what speaks for it, with its points.
     """
     scores = {name: sum(points for points, _ in found) for name, found in reasons.items()}
     best, second = sorted(scores, key=lambda name: -scores[name])[:2]

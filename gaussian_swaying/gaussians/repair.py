@@ -51,9 +51,6 @@ def repaired(
     A size of zero becomes a thousandth of the largest one of its Gaussian. An infinite logit of the opacity becomes
     ±16.
 
-    Args:
-        path: The file, for messages.
-
     Raises:
         ValueError: If more have none.
 
@@ -90,11 +87,7 @@ def repaired(
 
 
 def check_units(path: Path, cloud: GaussianCloud) -> None:
-    """Warn of numbers that no scene has, as in a file without logarithms or logits; ValueError if none is possible.
-
-    Args:
-        path: The file, for messages.
-    """
+    """Warn of numbers that no scene has, as in a file without logarithms or logits; ValueError if none is possible."""
     wide, told = cloud.scales.amax(-1), list[str]()
     if len(cloud) < _FEW:
         return
@@ -122,7 +115,6 @@ def cloud_of(path: Path, others: dict[str, np.ndarray] | None = None, **columns:
     """The Gaussians of a file as float32 tensors, :func:`repaired`.
 
     Args:
-        path: The file, for messages.
         columns: The fields of :class:`GaussianCloud` but its origin, with their shapes and units.
     """
     origin = origin_of(columns["means"])

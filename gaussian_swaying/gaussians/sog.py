@@ -158,7 +158,6 @@ def _single(path: Path) -> GaussianCloud:
 
 @contextmanager
 def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
-    """The zip file of a bundle; whatever is wrong with it is a ValueError that names it."""
     try:
         with zipfile.ZipFile(path) as archive, path.open("rb") as stream:
             begins = stream.read(4)

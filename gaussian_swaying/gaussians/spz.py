@@ -280,7 +280,6 @@ def _int24(values: np.ndarray) -> np.ndarray:
 
 
 def _from_three(raw: np.ndarray) -> np.ndarray:
-    """Quaternions wxyz from bytes of x, y and z; w is not negative."""
     xyz = raw.reshape(-1, 3) / 127.5 - 1
     return np.concatenate([np.sqrt(np.clip(1 - np.square(xyz).sum(-1, keepdims=True), 0, None)), xyz], axis=1)
 

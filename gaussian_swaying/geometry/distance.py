@@ -23,7 +23,6 @@ LEAST = tl.constexpr(1.0842022e-19)
 
 @triton.jit
 def _outwards(x):
-    """Length and direction of a vector; z for one without a direction."""
     length = tl.sqrt(dot3(x, x))
     some = length > LEAST
     return length, where3(some, scale3(1 / tl.where(some, length, 1.0), x), (0.0, 0.0, 1.0))
@@ -74,7 +73,6 @@ def half_space_distance(x, numbers, table, mask, OPTIONS: tl.constexpr):
 
 @triton.jit
 def _low(x, n):
-    """Return the node below a place along an axis of n nodes, within the grid, and the distance beyond it."""
     inside = tl.minimum(tl.maximum(x, 0.0), (n - 1).to(tl.float32))
     first = tl.maximum(tl.minimum(tl.floor(inside), (n - 2).to(tl.float32)), 0.0)
     return first.to(tl.int32), inside - first, x - inside

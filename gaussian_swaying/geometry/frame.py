@@ -64,7 +64,6 @@ class SimFrame:
 
         Args:
             points: Points of the object in scene units, shape (N, 3).
-            up: Direction in the scene that points up.
             longest_side: Longest side of the object's box, along the simulation axes [m]; PhysGaussian's normalisation
                 is 1. Excludes ``metres_per_unit``.
             metres_per_unit: Length of a scene unit [m]; 1 if neither is given.

@@ -87,7 +87,7 @@ def is_number(value: Value) -> bool:
 
 @lru_cache(maxsize=4096)
 def _constant(number: Any, sign: float, kind: str, shape: Shape) -> Block:
-    """A block of one number; LLVM's value of it is immutable, and writes itself once."""
+    """LLVM's constant is immutable, and writes itself once."""
     lanes = math.prod(shape)
     if lanes == 1:
         return Block(ir.Constant(TYPES[kind], number), kind, shape)
@@ -163,7 +163,6 @@ class Emitter:
         return made
 
     def _float_to_int(self, block: Block, to: ir.Type) -> Any:
-        """As a GPU does: the nearest integer towards zero; for NaN and beyond the range the nearest that there is."""
         return self.intrinsic("llvm.fptosi.sat", [block.value], to, [to, block.value.type])
 
     def splat(self, block: Block, shape: Shape) -> Block:
@@ -372,7 +371,6 @@ class Emitter:
         return self._dummy[kind]
 
     def _where(self, pointer: Pointer, mask: Value, *blocks: Block) -> tuple[Block | None, Shape]:
-        """A mask, if it is not all true, and the shape of a pointer, the mask and some blocks."""
         mask = None if mask is None or mask is True else self.convert(self.block(mask), "i1")
         return mask, self.common_shape(*(each.shape for each in (pointer.offset, *blocks, mask) if each is not None))
 

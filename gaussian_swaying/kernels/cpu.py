@@ -136,7 +136,6 @@ def _linker() -> Any:
 
 
 def _compiled(text: str, machine: Any = None) -> bytes:
-    """An object file from LLVM's text, for this processor if no other code generator is given."""
     llvm, machine = _llvm(), machine or _machine()
     module = llvm.parse_assembly(text)
     module.verify()
@@ -165,7 +164,6 @@ _spent = [0, 0.0, 0.0]
 
 
 def _address(kernel: Any, constants: dict[str, Any], kinds: dict[str, str], real: str) -> int:
-    """The address of a compiled kernel: from memory, from disk, or compiled now."""
     key = (kernel, tuple(constants.items()), tuple(kinds.values()), real)
     address = _COMPILED.get(key)
     if address is None:
@@ -409,9 +407,6 @@ def launch(kernel: Any, grid: Sequence[int], *given: Any, **named: Any) -> None:
     Its real numbers are of double precision if it gets tensors of them and none of single precision.
 
     Args:
-        kernel: The kernel.
-        grid: Number of programs along each of up to three axes.
-        given: Its first arguments: contiguous tensors, numbers, constants.
         named: Its other arguments; those that only a GPU needs are ignored.
     """
     names, constant = _parameters(kernel)

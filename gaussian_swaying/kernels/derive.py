@@ -91,10 +91,6 @@ def on_tensors(function: Any, look_in: bool = False) -> Callable[..., Any]:
 
     Constants are plain numbers and tuples. Tensors must broadcast; results have their type, device and gradient.
 
-    Args:
-        function: The device function.
-        look_in: Whether to run the text of a primitive, too.
-
     Raises:
         TraceError: When it is called, if the function loads from memory or branches on a value.
     """
@@ -138,7 +134,6 @@ def _call(function: Any, *given: Any, **named: Any) -> Any:
 
 @cache
 def _python(function: Any) -> Callable[..., Any]:
-    """The text of a device function with the torch version of the language in place of Triton's."""
     lines, first = inspect.getsourcelines(function.fn)
     tree = ast.parse(textwrap.dedent("".join(lines)))
     made = next(node for node in tree.body if isinstance(node, ast.FunctionDef))
@@ -449,7 +444,6 @@ def gradient(outputs: Sequence[Any], inputs: Any, bars: Sequence[Any] | None = N
 
 
 def _order(outputs: Sequence[Any]) -> list[Symbol]:
-    """All symbols that some need, each after those that it needs."""
     seen: set[int] = set()
     order: list[Symbol] = []
     pending: list[tuple[Any, bool]] = [(output, False) for output in reversed(list(_leaves(tuple(outputs))))]
@@ -538,11 +532,7 @@ def difference(output: Any, inputs: Sequence[Symbol], others: Sequence[Any], ste
     """(f(x) - f(y)) / gap without cancellation, from f(x) and y.
 
     Args:
-        output: f(x).
-        inputs: x.
-        others: y.
         steps: The entries of x - y as multiples of the gap.
-        gap: The gap.
     """
     order = _order([output])
     there: dict[int, Any] = {}
@@ -623,7 +613,6 @@ def _moved(node: Symbol, moves: list[Any], at: Callable[[Any], Any], end: Any, g
 
 
 def _share_above(x: Any, y: Any, floor: Any) -> Any:
-    """Share of the way from y to x that lies above a floor."""
     make, gap = x.graph.make, x - y
     none = make("==", gap, 0.0)
     above = (make("maximum", x, floor) - make("maximum", y, floor)) / make("where", none, 1.0, gap)
@@ -637,7 +626,6 @@ def device_function(name: str, shapes: dict[str, Shape], formula: Callable[..., 
     """A device function from a formula of symbols.
 
     Args:
-        name: Its name; a part that identifies its text is added.
         shapes: The shapes of its arguments, by name.
         formula: Takes the symbols and returns a number or a tuple; it may call ``on_tensors(function)``.
     """
@@ -656,7 +644,6 @@ def device_function(name: str, shapes: dict[str, Shape], formula: Callable[..., 
 
 
 def _body(result: Any) -> tuple[str, dict[str, Any]]:
-    """The statements that compute a result, and the functions that they call."""
     names: dict[int, str] = {}
     known: dict[str, Any] = {}
     lines: list[str] = []
@@ -705,10 +692,7 @@ def vjp(function: Any, shapes: dict[str, Shape], by: Sequence[str], constants: d
     argument.
 
     Args:
-        function: The device function.
         shapes: Shapes of the arguments that are numbers, by name.
-        by: Names of the arguments by which gradients are wanted.
-        constants: The other arguments.
     """
     graph = Graph()
     given = {key: graph.argument(key, shape) for key, shape in shapes.items()}

@@ -70,7 +70,6 @@ def tensors_in(modules: Iterable[nn.Module]) -> list[torch.Tensor]:
 
 
 def _parts(modules: Iterable[nn.Module]) -> Iterator[nn.Module]:
-    """Yield modules, each followed by all that it contains."""
     for module in modules:
         yield module
         yield from _parts(child for child in vars(module)["_modules"].values() if child is not None)
@@ -153,10 +152,7 @@ class Repeater:
         After that it is recorded and replayed. On a CPU it is recorded while it runs for the first time.
 
         Args:
-            times: Number of repetitions.
-            key: Identifies the work.
             work: Runs it once; its argument is how often it ran since ``counter`` changed.
-            recordable: Whether it may be recorded.
             launches: Whether it consists of launches of kernels, and of calls by ``kernels.launch.call``; only then is
                 it recorded on a CPU.
             counter: A whole number on the device that is to grow by one each time.
@@ -190,7 +186,6 @@ class Repeater:
                 times -= size
 
     def _run_on_cpu(self, times: int, key: Hashable, several: Callable[[int], None]) -> None:
-        """As :meth:`run`; the launches of the first time are kept, and run again without Python in between."""
         from gaussian_swaying.kernels.cpu import recording
 
         while key not in self._graphs and len(self._graphs) >= self.kept:

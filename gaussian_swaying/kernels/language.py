@@ -65,7 +65,6 @@ class Function:
 
 
 def _note(function: Function, found: dict[str, str]) -> None:
-    """Add the source of a function, of those that it calls, and the constants of their modules, by name."""
     found[repr(function)] = inspect.getsource(function.fn)
     names = function.fn.__code__.co_names
     homes = [function.fn.__globals__]

@@ -53,7 +53,6 @@ def replaces(given: Iterable[Tensor], dtype: torch.dtype | None = torch.float32)
     Triton's interpreter replaces nothing, as it takes far longer.
 
     Args:
-        given: All tensors that the result depends on, on one device.
         dtype: The only type that the kernel takes; None for any.
     """
     known = list(given)
@@ -88,10 +87,6 @@ def launch(kernel: Any, grid: Sequence[int]) -> Callable[..., None]:
 
     It takes the arguments of the kernel, of which tensors are contiguous and on one device, and options of Triton,
     which a CPU does not need.
-
-    Args:
-        kernel: The kernel.
-        grid: Number of programs along each of up to three axes.
     """
 
     def run(*given: Any, **named: Any) -> None:

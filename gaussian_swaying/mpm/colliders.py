@@ -262,7 +262,6 @@ class Obstacle(Boundary):
         self.table: Tensor
 
     def _solid(self, frame: SimFrame | None) -> dict[str, Tensor]:
-        """The numbers and the table of its distance in scene units, or in the metres of a frame."""
         axes = rotation_of(torch.deg2rad(torch.tensor(self.rotation, dtype=torch.float64)))
         unit, axes = (1.0, axes) if frame is None else (frame.metres_per_unit, frame.rotation @ axes)
         numbers, table = self.shape.solid(unit, axes)
@@ -369,8 +368,6 @@ class Obstacle(Boundary):
 
 
 def _placed(solid: DeviceFunction, gap: float, friction: float, centre: Tensor) -> DeviceFunction:
-    """The device function of a solid whose numbers begin with gap, friction and place of its centre."""
-
     def numbers() -> Tensor:
         shape = torch.as_tensor(own.take()).to(centre)
         return torch.cat([centre.new_tensor([gap, friction]), centre, shape.reshape(-1)])
@@ -383,12 +380,7 @@ Solid = Wall | Obstacle
 
 
 def solids_of(boundaries: Sequence[Boundary], pins: Container[int] = ()) -> list[tuple[Solid, int]] | None:
-    """All solids, each with the number of its boundary; None if a boundary has no device function.
-
-    Args:
-        boundaries: The boundary conditions of a body.
-        pins: Numbers of those that are no solids.
-    """
+    """All solids, each with the number of its boundary; None if a boundary has no device function."""
     others = [(one, k) for k, one in enumerate(boundaries) if k not in pins]
     if any(boundary.device_function() is None for boundary, _ in others):
         return None

@@ -350,7 +350,6 @@ def _keep(data, other, slots, places, p, many, acts, q, n0, n1, n2, target):
 
 @triton.jit
 def _target(gap, push, most, dt):
-    """The least velocity along the normal after the substep."""
     return tl.where(gap > 0, -gap, tl.minimum(-gap * push, most)) / dt
 
 

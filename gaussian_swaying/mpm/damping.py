@@ -17,7 +17,6 @@ def decay_rate(ratio: float, frequency: float) -> float:
     mass part), so one of twice the frequency has half of it.
 
     Args:
-        ratio: :math:`\zeta`, share of critical damping.
         frequency: f [Hz].
     """
     return 4 * math.pi * frequency * ratio

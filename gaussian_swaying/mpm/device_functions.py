@@ -129,7 +129,6 @@ class Composed(Constant):
 
 
 def _places(counts: Any) -> tuple[tuple[int, int], ...]:
-    """First and number of some groups of numbers, one after the other."""
     found, first = [], 0
     for count in counts:
         found.append((first, count))
@@ -150,7 +149,6 @@ def device_key(function: Any) -> str:
 def _pieces(
     given: Sequence[DeviceFunction], layout: Composed, start: int, numbers: bool
 ) -> Iterator[tuple[DeviceFunction, list[tuple[int, Numbers]]]]:
-    """Yield each device function and its parts with the places of its numbers and of its table in a buffer."""
     for one, part, (first, _), table in zip(given, layout.parts, layout.numbers, layout.tables, strict=True):
         yield from _pieces(one.parts, part, start + table, True)
         yield (one, [(start + first, one.numbers if numbers else NONE), (start + table + part.size, one.table)])

@@ -106,7 +106,6 @@ class LawDispatch:
 
 
 def _as_tuple(found: Tensor | tuple[Tensor, Tensor | None], internal: Tensor | None) -> tuple[Tensor, ...]:
-    """The results of a law; if it has no internal variable, the given one is returned unchanged."""
     if isinstance(found, Tensor):
         return (found,)
     first, second = found
@@ -191,7 +190,6 @@ def _numbers(row):
 
 @triton.jit
 def _principal(a, mu, lam, internal, which, p, LAWS: tl.constexpr):
-    """Principal first Piola-Kirchhoff stresses; arbitrary for a law with another kind of stress."""
     y = LAWS.principals[0](a, mu, lam, internal, p)
     for k in tl.static_range(1, len(LAWS.principals)):
         y = where3(which == k, LAWS.principals[k](a, mu, lam, internal, p), y)
@@ -234,7 +232,6 @@ def pk1_adjoint(F, Q, mu, lam, row, ADJOINTS: tl.constexpr):
 
 @triton.jit
 def _flow(a, mu, lam, internal, which, p, dt, LAWS: tl.constexpr):
-    """Principal stretches and internal variable after plastic flow."""
     new, inner = LAWS.flows[0](a, mu, lam, internal, p, dt)
     if not LAWS.all_flow:
         new = where3(which == 0, new, a)

@@ -230,7 +230,6 @@ class Structure:
         return pinned, rows
 
     def _tie(self) -> list[Any]:
-        """Rows that make a piece which nothing holds follow the nearest point that is held, as if glued to it."""
         import scipy.sparse as sparse
         from scipy.sparse.csgraph import connected_components
         from scipy.spatial import cKDTree
@@ -263,7 +262,6 @@ class Structure:
         return rows
 
     def _degrees(self) -> Any:
-        """The degrees of freedom: nodes with mass that nothing holds, and six of each rigid part."""
         import scipy.sparse as sparse
 
         free = (self.pinned < 0) & (self.mass > 1e-7 * self.mass.max())
@@ -345,7 +343,6 @@ class Structure:
         return self._result(square[chosen], S @ modes[:, chosen], float(first), second, int(loose.sum()))
 
     def _first_guess(self) -> float:
-        """A shift that is too large: the square of the frequency of a wave along the body."""
         side = float(np.ptp(self.rest, axis=0).max())
         return max(self.volume.sum() / max(side, 1e-30) ** 2, 1e-300)
 
@@ -475,7 +472,6 @@ def analysis_of(total: Total, scene: int, most: int, guess: float | None = None)
 
 
 def _content(total: Total, scene: int, most: int) -> str:
-    """A hash of what the modes depend on, but for :func:`_numbers`."""
     points, digest = total.points, hashlib.sha256()
     count = points.count
 

@@ -206,7 +206,6 @@ class Modes(Total):
         return values.new_zeros(*values.shape[:-2], self.sites, values.shape[-1]).scatter_add(-2, index, values)
 
     def _grouped(self, force: Force) -> Force | None:
-        """A force on the sites, made once; None if it has to see all points."""
         if force not in self._forces:
             self._forces[force] = force.on_sites(self.site, self.sites)
         return self._forces[force]
@@ -216,7 +215,6 @@ class Modes(Total):
         return self.at_sites(mass * values) / self.site_mass[..., None].clamp(min=torch.finfo(mass.dtype).tiny)
 
     def _kernel(self, state: MPMState, groups: Sequence[Force | None], time: Tensor, dt: float, steps: int) -> Any:
-        """The kernel of the forces on the sites, with their numbers; None where torch computes them."""
         device_functions = [force.device_function() for force in groups if force is not None]
         given = [state.position, *tensors_of([force for force in groups if force is not None]), *self.tensors()]
         if not device_functions or None in device_functions or not replaces((state.position,)):
@@ -231,7 +229,6 @@ class Modes(Total):
         return self._site_forces
 
     def _site_state(self, moved: Tensor, time: Tensor) -> State:
-        """The sites as points that turn without strain, by their displacements and turns and the rates of both."""
         shift, turn = moved.unflatten(-2, (2, -1, 3)).unbind(-4)
         turn = turn[..., 0]
         R = rotation_of(turn)
@@ -341,11 +338,7 @@ class Modes(Total):
 
     @torch.no_grad()
     def leaning(self, force: Force, rounds: int = 40) -> MPMState:
-        """The state in which a steady force is in balance with the stiffness, by damped iteration.
-
-        Args:
-            rounds: Iterations, each of which goes half of the way.
-        """
+        """The state in which a steady force is in balance with the stiffness, by damped iteration."""
         state = self.first_state(torch.zeros_like(self.points.position), 0)
         q, p = self.amplitudes(state)
         group, square = self._grouped(force), self.square.to(q)
@@ -368,7 +361,6 @@ class Modes(Total):
     def _drag(
         self, resistance: Tensor | None, general: tuple[Tensor, Tensor | None, Tensor] | None, gain: Tensor
     ) -> tuple[Tensor | None, Callable[[Tensor], Tensor]]:
-        """Drag of the modes, (..., M, M), and a function that solves with one plus half of the drag times the gain."""
         drag = None
         if resistance is not None:
             weight = resistance.repeat_interleave(3, -1)[..., None]
@@ -384,7 +376,6 @@ class Modes(Total):
     def _lagging(
         self, state: MPMState, forces: Sequence[Force], groups: Sequence[Force | None]
     ) -> Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor | None, Tensor]] | None:
-        """Loads on the modes, their drag, and loads on the sites, of forces that need all points; None without any."""
         others = [force for force, group in zip(forces, groups, strict=True) if group is None]
         if not others:
             return None

@@ -160,7 +160,6 @@ class Solver(nn.Module, ABC):
 
         Args:
             frame_dt: Length of the frame [s].
-            cells: The result of :meth:`cells_per_second`, if it is known.
         """
         if self.substep is not None:
             return fixed_substeps(frame_dt, self.substep, self.stable_substep(state), self.dx)

@@ -102,7 +102,6 @@ class Run(ABC):
         """Return the reason why these kernels cannot run a body, or None if they can.
 
         Args:
-            bound: The formulation, bound to the body.
             interpret: Whether Triton's interpreter, if it is on, may run them on a CPU.
         """
         points = bound.points
@@ -150,10 +149,7 @@ class Run(ABC):
         """Advance by ``steps`` substeps of ``dt`` [s], with forces or with one constant force (see ``MPMSolver.step``).
 
         Args:
-            state: The state now.
             dt: Substep [s].
-            steps: Number of substeps.
-            forces: Forces; those without a device function must be recordable.
             force: Force [N], shape (..., P, 3), or None; only without ``forces``.
             drag: Its resistance [kg/s], shape (..., P), or None.
             looks: Numbers of the substeps after which the wave speed is measured, if ``watches``.
@@ -270,18 +266,15 @@ class Run(ABC):
         return added([split(force(state), force, state) for force in self.asked])
 
     def _asked_key(self) -> tuple[object, ...]:
-        """Return the key of the recorded forces."""
         return recorded_key(self.asked) if self.asked else ()
 
     def _resists(self, state: MPMState) -> bool:
-        """True if a force in torch returns a resistance; calls each force once."""
         key = self._asked_key()
         if key != self._resist[0]:
             self._resist = key, self._ask(state)[1] is not None
         return self._resist[1]
 
     def _push(self) -> None:
-        """Compute the forces in torch from the particles in the buffers, and fill the force buffer."""
         self._fill(*self._ask(self._look_at()))
 
     def _room(self, name: str, *shape: int, dtype: torch.dtype | None = None) -> Tensor:

@@ -316,7 +316,6 @@ class MPMSolver(Fixed, Solver):
         return self._kernels
 
     def _wanted(self, *tensors: Tensor | None) -> bool:
-        """True if the body or one of some tensors requires a gradient, and gradients are enabled."""
         asking = (*self.bound.tensors(), *tensors)
         return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in asking)
 
@@ -621,11 +620,7 @@ def _check_begin(bound: Formulation, state: MPMState, dt: float, steps: int, lim
     """Check the arguments of a rollout.
 
     Args:
-        bound: The formulation, bound to its material.
-        state: The state to start from.
         dt: Substep [s].
-        steps: Number of substeps.
-        limit: Whether to refuse a substep with which nothing is stable.
 
     Returns:
         The number of substeps as an integer of Python.
@@ -703,11 +698,7 @@ def _check_end(
     """Raise an error if the state after a rollout is not valid (one GPU synchronisation).
 
     Args:
-        bound: The formulation, bound to its material.
-        before: The state at the start of the rollout.
-        after: The state at its end.
         dt: Substep [s].
-        steps: Number of substeps.
         forces: The forces that acted; called once more, for the first substep, if something is NaN.
     """
     check_pace(dt, bound.obstacle_cells(before, steps * dt), "dt")

@@ -304,7 +304,6 @@ class MaterialPoints:
 
 
 def _check_attached(attached: Tensor, count: int) -> None:
-    """Raise ValueError unless it is a number for each point, or pairs of points."""
     if attached.dtype != torch.int64 or not (attached.shape == (count,) or attached.shape[1:] == (2,)):
         raise ValueError(
             f"Expected `attached` to be int64, of shape ({count},) with a number for each point or (E, 2) with pairs "
@@ -315,7 +314,6 @@ def _check_attached(attached: Tensor, count: int) -> None:
 
 
 def _optional(parts: Sequence[MaterialPoints]) -> dict[str, list[Tensor]]:
-    """The optional fields that one of several bodies has, for all of them: zero where one has none."""
     found = {}
     for name in _OPTIONAL_FIELDS:
         given = [getattr(part, name) for part in parts]

@@ -357,7 +357,6 @@ class UpdatedRun(Run):
         return sorted_for(self.crowd, self.crossing, self.count)
 
     def _measure_crossing(self) -> None:
-        """Measure how many cells a particle enters in a substep, on average, without waiting."""
         if not self.atomic:
             return
         self._measured.copy_(self._crossing(self.moving[12:15]), non_blocking=True)
@@ -385,13 +384,11 @@ class UpdatedRun(Run):
         return found[: self.scenes]
 
     def _start(self, options: dict[str, Any]) -> None:
-        """The start of a substep without the end of the one before."""
         if self.asked:
             self._push()
         self._particles(0, options, gather=False, scatter=True)
 
     def _sort(self) -> None:
-        """Sort the rows of the particles by cell: count those of each cell, and move each to its place."""
         if not self.atomic:
             order = torch.argsort(self._keys(self.moving[:3].T), stable=True)
             self.moving.copy_(self.moving[:, order])
@@ -544,7 +541,6 @@ class UpdatedRun(Run):
         return (weight * self.inverse_mass[:nodes]).reshape(shape)
 
     def _read(self, room: Callable[..., Tensor]) -> dict[str, Any]:
-        """Particle fields, in tensors that ``room`` makes for a name and a shape."""
         shape = self.bound.points.position.shape
         fields: dict[str, Any] = {name: room(name, *shape) for name in ("position", "velocity")}
         fields |= {name: room(name, *shape, 3) for name in ("affine", "F_elastic")}

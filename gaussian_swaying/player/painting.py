@@ -198,7 +198,6 @@ class Painting:
         return found
 
     def _adopt(self, simulation: Simulation) -> Strokes:
-        """The strokes on the Gaussians of a simulation; those on others are forgotten."""
         scene, settings = simulation.scene, self.session.settings.scene
         source = (str(settings.ply), str(settings.generator), str(len(scene.drawn)))
         if self._strokes is None or source != self._source:
@@ -258,7 +257,6 @@ class Painting:
         self._show()
 
     def _seen(self, snapshot: Snapshot, eye: Eye) -> Seen:
-        """The Gaussians as a browser sees them; kept until it looks from elsewhere, or they move."""
         key = (snapshot.number, eye.size, eye.fov, eye.near, eye.matrix.tolist())
         if self._view is not None and self._view[0] == key:
             return self._view[1]

@@ -124,7 +124,6 @@ def colour_message(simulation: Simulation, film: Film, roles: Tensor, known: Ten
 
     Args:
         roles: Their roles in the splat, see :func:`~gaussian_swaying.rendering.tints.by_role`, shape (N,).
-        known: The same before.
     """
     order = torch.from_numpy(film.order)
     place = (roles != known)[order].nonzero()[:, 0]
@@ -141,11 +140,7 @@ def colour_message(simulation: Simulation, film: Film, roles: Tensor, known: Ten
 
 @torch.inference_mode()
 def state_message(snapshot: Snapshot, ended: bool) -> bytes:
-    """The displacement of the nodes of a state: 6 bytes each, and 16 more for one that moved far.
-
-    Args:
-        ended: Whether no other state follows for now.
-    """
+    """The displacement of the nodes of a state: 6 bytes each, and 16 more for one that moved far."""
     simulation, scene = snapshot.simulation, snapshot.simulation.scene
     with turn(simulation):
         moved = scene.follow.nodal(snapshot.state)
@@ -343,7 +338,6 @@ class Server:
             await runner.cleanup()
 
     def _follow(self) -> None:
-        """Wake the browsers after each step."""
         assert self.session is not None
         number = -1
         while not self._closing.is_set():
@@ -375,7 +369,6 @@ class Server:
         return answer
 
     async def _head(self, request: web.Request, response: web.StreamResponse) -> None:
-        """Headers that forbid frames and connections elsewhere."""
         own = request.headers.get("Host", "")
         response.headers["Content-Security-Policy"] = (
             f"frame-ancestors 'none'; connect-src 'self' ws://{own} wss://{own} blob: data:"
@@ -420,7 +413,6 @@ class Server:
         return self.painting.saved(self.scratch / FILE)
 
     async def _load(self, request: web.Request) -> web.Response:
-        """Load a splat or a configuration; of its name only the ending is used."""
         ending = Path(request.query.get("name", "")).suffix.lower()
         kinds = [own for format in FORMATS.values() if format.read for own in format.endings]
         configured = ending in (".yaml", ".yml")
@@ -464,7 +456,6 @@ class Server:
         return settings_of_splat(self.session.parser, path, device, path.parent, tell=self.progress, quick=quick)
 
     def _read_configuration(self, path: Path) -> Namespace:
-        """The settings in a configuration; if its splat is not on this computer, they get the present one."""
         assert self.session is not None
         self.progress(0.1, "Reading the configuration")
         try:
@@ -503,7 +494,6 @@ class Server:
         return connection
 
     async def _hear(self, client: Client, said: dict[str, Any]) -> None:
-        """Do what a browser asks for."""
         kind, session = said["kind"], self.session
         if kind == "ack":
             client.confirm(said["count"], said["rate"])
@@ -539,7 +529,6 @@ class Server:
         return await self._loop.run_in_executor(self._work, partial(what, *given))
 
     def _place(self, metres: Sequence[float]) -> list[float]:
-        """A place in scene units."""
         assert self.session is not None
         place = torch.tensor(metres, dtype=torch.float64)
         if place.shape != (3,) or not bool(place.isfinite().all()):
@@ -566,7 +555,6 @@ class Server:
     # ---- what it gets
 
     async def _feed(self, client: Client) -> None:
-        """Send a browser what is new until it is gone."""
         while True:
             with suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(client.wake.wait(), TOLD_EVERY)
@@ -590,7 +578,6 @@ class Server:
             await asyncio.sleep(max(1 / MOST_PER_SECOND - (self._loop.time() - began), 0))
 
     def _news(self) -> dict[str, Any]:
-        """Controls and figures, the same for all browsers."""
         now = time.monotonic()
         settings = None if self.session is None else self.session.settings
         if now - self._texts[0] < TOLD_EVERY and settings is self._texts[1]:
@@ -618,7 +605,6 @@ class Server:
         return found
 
     async def _send(self, client: Client, session: Session) -> None:
-        """Send what a browser lacks of the newest snapshot: the scene, light, colours, and the state, or a picture."""
         snapshot, still = session.snapshot, session.paused or session.broken
         if client.show != "color" or client.server or not drawable(snapshot):
             await self._send_picture(client, session, snapshot, still)

@@ -453,7 +453,6 @@ class Session:
             self.revision += 1
 
     def _advance(self, single: bool) -> None:
-        """One step, then wait until its time has come."""
         simulation, began = self.simulation, time.perf_counter()
         try:
             with torch.inference_mode():
@@ -554,7 +553,6 @@ class Session:
         self.revision += 1
 
     def _take_settings(self, settings: Namespace, fresh: bool = False) -> None:
-        """Make the simulation anew; unless ``fresh``, it goes on from where it is if its nodes stay the same."""
         simulation = _drawn_roughly(Simulation.from_settings(self.parser, settings))
         start = simulation.start()
         state = None  # goes on only between solvers that can
@@ -580,7 +578,6 @@ class Session:
 
 
 def _drawn_roughly(simulation: Simulation) -> Simulation:
-    """A simulation of which a renderer on a CPU thins Gaussians that are much smaller than a pixel."""
     simulation.painter.renderer = make_renderer(simulation.device, detail=DETAIL)
     return simulation
 
@@ -672,7 +669,6 @@ def sentence(configured: float, chosen: float, configured_speed: float, speed: f
     Args:
         configured: Its spacing [m].
         chosen: Spacing of the grid that was chosen [m].
-        configured_speed: Simulated seconds per second on the configured grid.
     """
     fast = f"predicted to run at {speed:.2g} x real time here"
     if chosen == configured:

@@ -110,9 +110,7 @@ def encode_video(frames: list[Path], path: Path, fps: float) -> None:
     """Encode images with :class:`VideoEncoder`.
 
     Args:
-        frames: PNG files in order.
         path: The .mp4 file.
-        fps: Frames per second.
     """
     import imageio.v3 as iio
 

@@ -105,7 +105,6 @@ def build_folder() -> Path:
 
 
 def _stamp(library: Path) -> str:
-    """All that a library of gsplat's kernels was compiled from, and its size and time."""
     from importlib.metadata import version
 
     found = importlib.util.find_spec("gsplat")

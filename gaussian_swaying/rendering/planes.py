@@ -77,7 +77,6 @@ def surface_maps(channels: Tensor, alpha: Tensor, camera: Camera, least_alpha: f
     Args:
         channels: Blended channels, shape (H, W, 4).
         alpha: Rendered opacity, shape (H, W, 1).
-        least_alpha: A pixel with less opacity shows no surface.
 
     Returns:
         The maps, differentiable where a surface is.

@@ -21,7 +21,6 @@ def tinted(colours: Tensor, tint: Sequence[int], share: float = 0.7) -> Tensor:
     Args:
         colours: From 0 to 1, shape (N, 3).
         tint: The other colour, from 0 to 255.
-        share: Its share.
     """
     target = torch.tensor(tint, dtype=colours.dtype, device=colours.device) / 255
     return (1 - share) * colours + share * target

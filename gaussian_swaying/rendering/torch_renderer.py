@@ -122,7 +122,6 @@ def _extent(covariances2d: Tensor, log_opacities: Tensor) -> Tensor:
 
 
 def _blocks(counts: Tensor, limit: int) -> tuple[Tensor, list[tuple[int, int]]]:
-    """Split consecutive items into blocks whose counts sum to about ``limit``."""
     running = counts.cumsum(0)
     total = int(running[-1]) if len(running) else 0
     marks = torch.arange(limit, total + limit, limit, device=counts.device)

@@ -704,7 +704,6 @@ def with_parts(scene: Scene, cloud: GaussianCloud, material: Material, solver: S
     """Material and solver with what the parts of a scene add to them; both stay as they are if it has none.
 
     Args:
-        scene: The scene, all in scene units.
         material: Its ``regions`` come after those of the parts, and win.
         solver: Gets a body for each part that is rigid, and a pin for all that are held, which holds nodes of the grid.
 
@@ -843,8 +842,6 @@ def sample_object(
         normal: Their unit normals, shape (S, 3).
         body_area: Areas that carry material [m²], shape (S,).
         area: Areas that feel the wind [m²], shape (S,).
-        filling: Samples inside a solid, if there are any.
-        frame: Conversion from scene units to metres.
         dx: Grid spacing [m], for ``material.volume = "cell"``.
     """
     surface = torch.ones(len(position), dtype=torch.bool)
@@ -937,8 +934,6 @@ def grouped(
 
     Args:
         dx: Grid spacing [m].
-        apart: Regions in scene units: those of pins and edits.
-        frame: Conversion from scene units to metres.
         piece: A number for each sample, the same for those that are attached in their cell, shape (N,); None if all
             are.
         home: The places by which they are grouped [m], shape (N, 3), if these are not their own.
@@ -1016,14 +1011,12 @@ def shared_wind(samples: Samples, owner: Tensor, parent: Tensor) -> tuple[Tensor
 
 
 def _parted(group: Tensor, parts: Tensor, which: Tensor) -> tuple[Tensor, Tensor]:
-    """Split some groups (M,) into single samples; return the groups (N,), and which of them are divided (M',)."""
     new = torch.where(which[group], len(parts) + torch.arange(len(group)), group)
     kept, group = torch.unique(new, return_inverse=True)
     return group, torch.cat([parts, torch.zeros(len(new), dtype=torch.bool)])[kept]
 
 
 def _points_of(samples: Samples, group: Tensor, parts: Tensor, side: float) -> tuple[Samples, Tensor, Tensor]:
-    """The points of all groups, the point of each sample, (N,), and the group of each point."""
     mass = samples.mass
     position, owner, of = matched_points(samples.position, mass, group, parts, side)
     count = len(position)
@@ -1261,9 +1254,7 @@ def body_of(
 
     Args:
         normals: Their unit normals, shape (N, 3).
-        frame: Conversion from scene units to metres.
         dx: Length that the solver resolves [m].
-        apart: Regions whose borders no group crosses, in scene units.
         labels: The part of each Gaussian, shape (N,), if the scene has parts.
 
     Returns:
@@ -1338,7 +1329,6 @@ def specks_of(
 
     Args:
         simulated: Indices of those that are simulated, shape (N,).
-        frame: Conversion from scene units to metres.
         dx: Length that the solver resolves [m].
 
     Returns:
@@ -1713,5 +1703,4 @@ class SimulatedScene(nn.Module):
 
 
 def _arm(arm: Tensor, dtype: torch.dtype) -> Tensor | None:
-    """Arms in the precision of the solver; None if all are zero."""
     return arm.to(dtype) if bool(arm.any()) else None

@@ -278,7 +278,6 @@ def draw(
     """The picture of a state of :func:`~gaussian_swaying.simulation.step.step`.
 
     Args:
-        camera: In scene units.
         shader: Colours from normals and light; None keeps the colours of the splat.
         background: Background colour, in [0, 1].
 
@@ -402,9 +401,6 @@ def streaks(stepper: Stepper, state: State, camera: Camera) -> tuple[Tensor, Ten
     The plane contains the direction of the flow, and is upright or level, whichever the camera sees better. They start
     at the points of a lattice that drifts with the mean flow, so that they move from frame to frame as the air does,
     and are as long as the air flows in a fixed time: an eighth of the picture at the speed of the flow.
-
-    Args:
-        camera: The camera, in scene units.
 
     Returns:
         Places, scene units, shape (S, STEPS + 1, 3), and the speed at them [m/s], shape (S, STEPS + 1).

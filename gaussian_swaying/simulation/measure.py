@@ -234,7 +234,6 @@ _WHOSE = dict(zip(_PARTICLES, ("displacement_max", "stretch_min", "stretch_max")
 
 
 def _joined(scenes: Sequence[FrameDiagnostics]) -> FrameDiagnostics:
-    """The measurements of a batch: sums, extremes with their particles, and the mean of mean displacements."""
     first, found = scenes[0], {}
     for name in _OF_SCENE:
         values = [getattr(scene, name) for scene in scenes]
@@ -394,7 +393,6 @@ def _verdict(solver: Solver, state: State, moved: Tensor) -> Tensor:
 
 
 def _raise_if_bad(solver: Solver, verdict: list[float], time: float) -> None:
-    """Raise SimulationDiverged if the values of :func:`_verdict` name a particle."""
     wrong, particle, lost = (int(value) for value in verdict[:3])
     if wrong == 0:
         return

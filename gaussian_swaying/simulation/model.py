@@ -175,7 +175,6 @@ class Model:
         return found
 
     def _owner(self, name: str) -> Any:
-        """The part that has a number; None if it is not there."""
         head, *path = name.split(".")[:-1] or [""]
         if head == "forces":
             return next((force for force in self.forces if type(force).__name__ == path[0]), None)
@@ -248,7 +247,6 @@ def _with_material(model: Model, numbers: Mapping[str, Any]) -> Model:
 
 
 def _check_one_layer(model: Model) -> None:
-    """Raise ValueError unless the object is a sheet of one layer, whose points stay if it gets thicker."""
     scene = model.scene
     if model.material.volume != "patch" or scene.filled or model.points.count != scene.on_surface + scene.filled:
         raise ValueError(
@@ -282,7 +280,6 @@ def of_settings(settings: Namespace, name: str) -> Any:
 
 
 def _place(settings: Namespace, name: str) -> tuple[Any, str]:
-    """The part of parsed settings that has a number, and its name there."""
     parts = name.split(".")
     if parts[0] == "forces":
         entry = next((one for one in settings.forces or () if one["class_path"].rsplit(".", 1)[-1] == parts[1]), None)

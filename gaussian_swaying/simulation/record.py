@@ -168,7 +168,6 @@ class Closing:
         return state.replace(**motion)
 
     def _motion(self, state: State) -> dict[str, Tensor]:
-        """What the Gaussians follow, and what is recorded of the nodes."""
         follow = self.scene.follow
         motion, nodal = {name: getattr(state, name) for name in follow.reads}, follow.nodal(state)
         return motion if nodal is None else motion | {NODAL: nodal}
@@ -307,7 +306,6 @@ class Run:
 
         Args:
             status: ``complete``, or how the run ended.
-            reason: Why, if it is not complete.
 
         Returns:
             The summary.

@@ -375,7 +375,6 @@ class Simulation(Fixed):
         self._recorder = self._recorder_or(recorder)
 
     def _recorder_or(self, recorder: Recorder | None) -> Recorder:
-        """A recorder of its own like the given one, or by default: with copies, of pictures."""
         if recorder is None and self._stepper.copies is not None:
             return Recorder(trajectory=False, nodes=False)
         return copy.copy(recorder or Recorder())
@@ -450,7 +449,6 @@ class Simulation(Fixed):
         return Stepper(self.solver.like(models[0].solver), models, turn=self.turn)
 
     def _running(self) -> dict[str, tuple[object, list[object]]]:
-        """What runs now by its names: each with the objects and versions of tensors that change if it does."""
         model, painter = self.model, self._painter
         parts = {name: getattr(model, name) for name in ("material", "wind", "aero", "forces", "air", "frame_dt")}
         parts |= {name: getattr(painter, name) for name in ("shader", "camera", "cameras", "background")}
@@ -779,7 +777,6 @@ class RecordedRun:
             yield editor.scene.deformed(state)
 
     def _states(self) -> Iterator[Any]:
-        """What the Gaussians follow in each frame."""
         start, trajectory = self.start, self.folder / "trajectory.npz"
         if (self.folder / "nodes.npz").is_file():
             nodes, displacement = self.nodes()

@@ -243,7 +243,6 @@ class Stepper:
         return self._wind_force[1]
 
     def _wind_on(self) -> WindForce:
-        """The wind on the patches of all scenes, computed together where it can be."""
         first, winds, places = self.models[0], [model.wind for model in self.models], None
         alone = WindForce(first.aero, first.wind, first.scene.patches)
         if not self.batched:
@@ -408,7 +407,6 @@ class Stepper:
         self.solver.substeps(rehearsed, self.frame_dt)
 
     def _restiffened(self) -> bool:
-        """Give the solver the material if it has another stiffness, and nothing else has changed."""
         before, now, stiffness = self._bound, self.materials, ("youngs_modulus", "poisson_ratio")
         others = [field.name for field in fields(MaterialPoints) if field.name not in stiffness]
         if len(before) != len(now) or any(
@@ -449,7 +447,6 @@ class Stepper:
         return f"it leans by {lean:.0%} of its size, more than modes can show" if lean > MOST_LEAN else None
 
     def _lean(self, bound: Modes) -> float:
-        """Mean displacement of the tenth that moves most in the strongest steady wind, over the longest side."""
         first, flows = self.model, self.flows().detach()
         strongest = WindField(flows[flows.norm(dim=-1).argmax()])
         state = bound.leaning(WindForce(first.aero, strongest, _repeated(first.scene.patches, len(self.models))))
@@ -459,7 +456,6 @@ class Stepper:
         return float(moved.topk(max(1, len(moved) // 10)).values.mean() / side)
 
     def _check_rounding(self, state: State, dt: float) -> None:
-        """Raise ValueError if rounding moves the material at rest nearly as fast as wind and gravity do."""
         drive = math.hypot(*self.solver.gravity)  # for a second
         if not self.idle:
             drive = max(drive, float(torch.linalg.vector_norm(self.flows().detach(), dim=-1).amax()))
@@ -605,7 +601,6 @@ class Stepper:
         )
 
     def _roll_with_air(self, state: State, substeps: int, watch: Callable[[int], None] | None) -> tuple[State, Tensor]:
-        """As :meth:`roll`, of the body and the computed air."""
         air = self._air
         assert air is not None
         if state.air is None or air.frame_dt != self.frame_dt:
@@ -799,14 +794,12 @@ def why_not_batched(model: Model) -> str | None:
 
 
 def _repeated(patches: Patches, count: int) -> Patches:
-    """The patches of several scenes, one after the other."""
     shift = patches.count * torch.arange(count, device=patches.point.device)
     point = (patches.point + shift[:, None]).reshape(-1)
     return Patches(patches.normal.repeat(count, 1), patches.area.repeat(count), point, patches.count * count)
 
 
 def _raised_here(error: BaseException) -> bool:
-    """True if an error was raised by this package, and not by code that it called."""
     place = error.__traceback__
     while place is not None and place.tb_next is not None:
         place = place.tb_next
@@ -814,7 +807,6 @@ def _raised_here(error: BaseException) -> bool:
 
 
 def _warn_falling(solver: Solver) -> None:
-    """Warn if gravity acts on an object that nothing holds or stops."""
     falls = isinstance(solver, MPMSolver) and any(solver.gravity)
     if falls and all(isinstance(part, Impulse | RigidRegion) for part in solver.boundaries):
         warnings.warn(
@@ -865,9 +857,6 @@ class SceneEditor:
     def edit(self, state: State, edits: Sequence[Edit]) -> State:
         """Apply edits now, whatever their time; if one is not possible, nothing changes.
 
-        Args:
-            edits: The changes, in this order.
-
         Returns:
             The state from which the run continues.
         """
@@ -888,7 +877,6 @@ class SceneEditor:
         return state if resumed else edited
 
     def _go_on(self, state: State, edits: Sequence[Edit]) -> State:
-        """Apply edits; the internal variable of particles that get another law starts anew."""
         rest = self.apply(edits, flowed=True, running=True)
         if rest is None:
             return state
@@ -949,11 +937,7 @@ class SceneEditor:
         return found
 
     def apply(self, edits: Sequence[Edit], flowed: bool = False, running: bool = False) -> State | None:
-        """Apply edits to the scene.
-
-        Args:
-            running: As for :meth:`Stepper.take`, whose result is returned.
-        """
+        """Apply edits to the scene."""
         scene = self.scene
         if edits and self.unedited is None:
             self.unedited = scene

@@ -80,7 +80,6 @@ def estimate_cost(
     Args:
         startup_seconds: Time to prepare the run [s], if known.
         budget: Time for the frames that are timed [s], about.
-        pictures: Whether pictures count, if the run makes some.
         cloud: All Gaussians that the run draws, if those of ``simulation`` are some of them.
     """
     solver, state, device = simulation.solver, simulation.start(), simulation.device

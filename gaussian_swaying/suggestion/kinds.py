@@ -106,9 +106,7 @@ def kind_of(own: Gaussians, up: Array, end: str, sheet: bool, names: list[str], 
     """Guess the kind of a thing.
 
     Args:
-        up: Up direction, a unit vector.
         end: Where it is held: ``top``, ``bottom``, ``side`` or ``none``.
-        leaf: Its leaves, if it has some.
 
     Returns:
         The name of the kind, and why, in words.

@@ -341,9 +341,6 @@ def survey(splat: Gaussians, up: Guess | None = None, cameras: Sequence[Camera] 
     - flat, as a cloth is (1);
     - in the photos: how much of it lies in them, on average (up to 2), if their cameras are known.
 
-    Args:
-        up: The up direction, if it was given.
-
     Returns:
         The parts, or None if it has no ground, or a single thing on a small one and no background: then it is an
         object.
@@ -513,7 +510,6 @@ def read_photos(path: Path, origin: Origin = NO_ORIGIN) -> Photos:
 
     Args:
         path: A transforms.json, a COLMAP model, or a folder that contains one.
-        origin: Point from which the places of the splat count.
     """
     cameras = [camera for _, camera in read_views(path, origin=origin)]
     eyes = np.array([camera.position.tolist() for camera in cameras])

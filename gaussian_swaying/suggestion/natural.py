@@ -183,7 +183,6 @@ def _height(structure: Structure, free: Array, kind: Kind) -> float:
 def _stiffness(
     structure: Structure, modulus: Tensor, mass: float, thicker: float, frequency: float, kind: Kind
 ) -> dict[float, float]:
-    """Factors on the moduli, by their values: first the leaves on pinned stems, then the stems."""
     E = modulus.double().cpu().numpy()
     values = np.unique(E)
     target, load = (2 * math.pi * frequency) ** 2, structure.loads(0)[:, :2]
@@ -238,7 +237,6 @@ def _on_pinned_stems(structure: Structure, leaves: Any, soft: Array, target: flo
 
 
 def _drag(simulation: Simulation, frontal: float, flow: Tensor, kind: Kind) -> float:
-    """Factor on the coefficients that gives the whole the drag of its kind in a wind along a flow."""
     aero, position = simulation.aero, simulation.model.points.position
     still = torch.zeros_like(position)
     identity = torch.eye(3).to(still).expand(*still.shape, 3)
@@ -251,7 +249,6 @@ def _drag(simulation: Simulation, frontal: float, flow: Tensor, kind: Kind) -> f
 
 
 def _with_drag(aero: AeroForce, factor: float) -> AeroForce:
-    """The same force with other coefficients."""
     return changed(aero, **{name: factor * getattr(aero, name) for name in ("C_D", "C_F", "C_L")})
 
 

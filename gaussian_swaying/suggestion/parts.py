@@ -202,7 +202,6 @@ def potted_plant(own: Gaussians, up: Array) -> Support | None:
 
 
 def _find_pot(across: Array, height: Array, weight: Array, green: Array) -> _Pot | None:
-    """The pot at the lower end, from slice to slice upwards; None if there is none."""
     slices = np.floor(height * SLICES)
     rings: list[tuple[float, Array, float]] = []
     missed = 0
@@ -238,7 +237,6 @@ def _find_pot(across: Array, height: Array, weight: Array, green: Array) -> _Pot
 
 
 def _ring(points: Array, weight: Array) -> tuple[Array, float] | None:
-    """Centre and radius of points around a circle, of which those inside do not count; None if it is none."""
     if len(points) < SECTORS:
         return None
     centre = np.average(points, 0, weight + 1e-300)
@@ -278,7 +276,6 @@ def _find_soil(across: Array, height: Array, share: Array, green: Array, pot: _P
 
 
 def _most_frequent(points: Array, label: Array) -> Array:
-    """The most frequent label among each point and its nearest neighbours."""
     from scipy.spatial import cKDTree
 
     if len(points) <= NEIGHBOURS:
@@ -333,7 +330,6 @@ def pot_by_colour(own: Gaussians, up: Array) -> Labels | None:
 
 
 def _along_sheet(means: Array, up: Array) -> Array | None:
-    """The level direction in an upright sheet, a unit vector; None if most of its upper half is no such sheet."""
     normal = sheet_normal(means)
     if normal is None:  # a foot makes the whole no sheet, and ripples the cloth
         height = means @ up

@@ -81,7 +81,6 @@ def linear_motion(bound: Modes, force: WindForce, wind: WindField, top: torch.Te
 
     Args:
         top: Share of each site in the top, shape (S,).
-        rate: Samples in a second.
     """
     from scipy.cluster.vq import kmeans2
 
@@ -112,7 +111,6 @@ def cloth_motion(wind: WindField, places: torch.Tensor, frequency: float, ratio:
     Args:
         places: Places [m], shape (K, 3).
         frequency: Frequency [Hz].
-        ratio: Damping ratio, with that of the air.
     """
     rate, omega = rate_for(frequency), 2 * math.pi * frequency
     push = _pressed(_air(wind, places.double().cpu().numpy(), rate, SAMPLES, 0).mean(1))
@@ -195,7 +193,6 @@ def _motion(load: Array, response: Response, rate: float) -> Motion:
 
 
 def _fault(value: Any, allowed: tuple[float, float, float]) -> Any:
-    """One for a value outside its range by the last number or more, and a little more the farther it is."""
     low, high, size = allowed
     apart = np.maximum(np.maximum(low - value, value - high), 0.0) / size
     return np.minimum(apart, 1.0) + 0.5 * apart

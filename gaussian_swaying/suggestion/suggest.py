@@ -311,7 +311,6 @@ def why_apart(scene: SimulatedScene, dx: float, held: Tensor) -> str | None:
 
 
 def _check_extent(points: Array) -> None:
-    """Raise ValueError if points are all one."""
     if extent(points, 0.0) <= 0:
         raise ValueError("All Gaussians of the object are at one point: there is nothing to simulate.")
 

@@ -382,9 +382,6 @@ def region_dict(region: Region) -> dict[str, Any]:
 def configuration(s: Suggestion, splat: Path, parts: Path, frames: int) -> str:
     """The configuration as text.
 
-    Args:
-        parts: That of its parts, if it has some.
-
     Returns:
         YAML for ``--config`` of a simulation.
     """
@@ -509,7 +506,6 @@ def _solver_damping(s: Suggestion) -> str:
 
 
 def _kind(s: Suggestion) -> str:
-    """Return the kind of a pin, with the reason as a comment: that of its shape for a sheet, nodes else."""
     if s.sheet:
         return "null              # points: a hinge, or a clamp if it is too thick there; `updated` needs nodes"
     return (
@@ -529,7 +525,6 @@ def _connected(s: Suggestion) -> str:
 
 
 def _padded(text: str, width: int) -> str:
-    """Text padded with blanks to a width, with at least one blank."""
     return f"{text:<{width - 1}} "
 
 

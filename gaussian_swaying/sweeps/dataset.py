@@ -103,7 +103,6 @@ def write_shards(
 
 
 def _numbers(value: Any) -> list[float]:
-    """The numbers in a value, nested lists flattened; empty if it contains anything else."""
     if isinstance(value, Real):
         return [float(value)]
     parts = [_numbers(item) for item in value] if isinstance(value, list) else []
@@ -172,7 +171,6 @@ def _sheet(folder: Path, runs: Mapping[str, Mapping[str, Any]], picture: str) ->
 
 
 def _frame(folder: Path, name: str, picture: str) -> Image | None:
-    """A frame of a run that has ended, small; None if there is none."""
     from PIL import Image
 
     result = read_result(folder, name)

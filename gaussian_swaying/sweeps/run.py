@@ -153,7 +153,6 @@ def _failed(job: Job, status: str, reason: str, **how: bool) -> Outcome:
 
 
 def _lost(job: Job, reason: str) -> Outcome:
-    """The outcome of a job whose process was killed, maybe after its last step."""
     written = {name: result for name in job.wanted if (result := read_result(job.folder, name)) is not None}
     done = {name: result for name, result in written.items() if result["status"] == "complete"}
     lost = _failed(job, "failed", reason, killed=True, ready=False)
@@ -161,7 +160,6 @@ def _lost(job: Job, reason: str) -> Outcome:
 
 
 def _unlocked(do: Callable[[], Any]) -> Any:
-    """Do what needs a folder, once it is free."""
     begin = time.monotonic()
     while True:
         try:
@@ -350,7 +348,6 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _without_ctrl_c() -> Iterator[None]:
-    """Block Ctrl-C for the processes that are started in the block; here it acts after the block."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return

@@ -45,7 +45,6 @@ class TrainCLI(LightningCLI):
         parser.set_defaults({f"checkpoint.{name}": value for name, value in CHECKPOINT_DEFAULTS.items()})
 
     def _chosen(self, config: Namespace) -> Namespace:
-        """The part of a configuration that belongs to the subcommand."""
         part: Namespace = config.get(str(self.subcommand), config)
         return part
 

@@ -419,7 +419,7 @@ class AirInBox:
         return state, last.clone() if self._pair else last, torch.stack(seen).amax()
 
     def _sets(self, moments: Tensor) -> list[Tensor]:
-        """Two sets of moments for the steps of a frame; on a GPU always the same ones."""
+        """On a GPU always the same tensors, as recordings keep their addresses."""
         if moments.is_cuda and not self._pair:
             with torch.inference_mode(False):
                 self._pair = [torch.empty_like(moments) for _ in range(2)]
@@ -447,7 +447,6 @@ class AirInBox:
         return taken
 
     def _end(self, now: Tensor, out: Tensor, substeps: int, dt: float, *given: Tensor) -> list[Tensor]:
-        """End a step: the air loses what the body took, and moves on under the last given, the wind at the faces."""
         self._lose(now, substeps, dt, *given[:-1])
         self.flow.advance(now, out, given[-1])
         return []

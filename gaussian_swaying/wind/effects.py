@@ -241,7 +241,6 @@ ROUND_GROWTH = tl.constexpr(0.05)
 
 @triton.jit
 def _direction(flow):
-    """Unit vector of a flow, zero in still air, and its speed."""
     speed = tl.sqrt(dot3(flow, flow))
     scale = 1 / tl.maximum(speed, 1e-12)
     return scale3(scale, flow), speed
@@ -431,7 +430,6 @@ def wake_start(drag: float) -> float:
 
 
 def _turned(frame: SimFrame, axes: Any) -> Any:
-    """Directions, as lists, in the axes of a simulation."""
     return frame.direction_to_sim(torch.tensor(axes, dtype=torch.float64)).tolist()
 
 

@@ -261,7 +261,6 @@ def flow_rows(name: str, flows: Sequence[VectorLike]) -> Tensor:
     """Flows [m/s] as one tensor, shape (K, 3), float64, with the gradients that are required.
 
     Args:
-        name: Name of the argument, for messages.
         flows: K flows, each a tensor of shape (3,), or three numbers of which some may be tensors.
     """
     rows = [_row(name, flow) for flow in flows]
@@ -379,7 +378,6 @@ class WindField(Fixed, nn.Module):
 
     @property
     def _known(self) -> bool:
-        """Whether its numbers can be those of several scenes."""
         parts = all("numbers" in vars(type(part)) for part in self.modulations)
         return type(self) is WindField and self.uniform and isinstance(self.seed, int) and parts
 
@@ -512,7 +510,6 @@ class WindField(Fixed, nn.Module):
         return velocity
 
     def _known_rows(self, time: Tensor) -> bool:
-        """Whether a kernel knows all modulations; not while a graph is recorded, if their numbers are not there yet."""
         parts = all("function" in vars(type(part)) for part in self.modulations)
         if not (len(self.modulations) and parts and type(self) is WindField and self.flows.dtype == torch.float64):
             return False
@@ -558,7 +555,6 @@ def _seeds(seeds: Sequence[int], like: Tensor) -> Tensor:
 
 
 def _with_buffers(module: M, **tensors: Tensor) -> M:
-    """A copy of a module with tensors in place of numbers."""
     other = changed(module)
     for name in tensors:
         vars(other).pop(name, None)

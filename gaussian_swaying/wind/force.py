@@ -197,7 +197,6 @@ def flow_adjoint(table, place, w, by_q):
 
 
 def _sums(patches: PatchSums, place: Any, w: tuple[Tensor, ...], LAW: int) -> Any:
-    """:func:`sums_over_patches` of tensors (P,)."""
     point, count, zero = patches.point, len(patches.tensor), (0.0, 0.0, 0.0)
     own = tuple(part.expand(count)[point] for part in w)
     terms = on_tensors(add_direction)(zero, zero, patches.vector.unbind(-1), own, LAW)

@@ -94,7 +94,6 @@ class PatchSums(nn.Module):
 
         Args:
             group: The group of each point, shape (P,).
-            coarse: As in the constructor.
         """
         length = self.vector.norm(dim=-1)
         normal = self.vector / length[:, None].clamp(min=torch.finfo(length.dtype).tiny)

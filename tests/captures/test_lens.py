@@ -48,7 +48,6 @@ def test_the_undistorted_picture_is_that_of_a_pinhole(distortion):
 
 @pytest.mark.parametrize("distortion", [FOX, BARREL, PINCUSHION])
 def test_the_undistorted_picture_is_the_largest_that_is_covered(distortion):
-    """Its corner pixels lie within the old pixel centres; one more column or row on any side does not."""
     lens = _lens(distortion)
     target = lens.undistorted()
 

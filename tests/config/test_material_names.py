@@ -17,8 +17,6 @@ SCENE = "scene: {generator: {class_path: FlagScene, init_args: {spacing: 0.1}}}\
 
 @pytest.fixture
 def read(tmp_path):
-    """The settings of several files, and of options after them."""
-
     def parse(*texts, options=()):
         arguments = []
         for k, text in enumerate(texts):

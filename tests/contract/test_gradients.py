@@ -17,7 +17,6 @@ DOUBLE = torch.float64
 
 
 def _simulation(values, edits=(), transfer="auto"):
-    """A flag in a wind that meets it obliquely, with a fixed number of substeps."""
     given = VALUES | values
     pin = PinnedRegion(up_to(x=0.11))
     return Simulation(
@@ -40,7 +39,6 @@ def _end(simulation):
 
 
 def _moved(values):
-    """A sum over the flag that no symmetry makes insensitive to any of the values."""
     simulation = _simulation(values)
     moved = _end(simulation).position - simulation.scene.points.position
     return (moved * double([3.0, 1.0, 2.0])).sum(-1).mean()

@@ -56,7 +56,6 @@ def test_first_two_commands():
 
 
 def _quick_start(folder, capsys, name, *more):
-    """The first run of the README, as it is or with a row of its table, and what it said besides its progress."""
     command = re.search(r"python tools/(sim\.py --config \S+)", README)[1].split()[1:]
     options = re.search(rf"^\| {name} \| `([^`]*)`", README, flags=re.MULTILINE)[1].split() if name else []
     assert main([*command, *options, "--device", "cpu", "--output", str(folder), *more]) == 0

@@ -49,7 +49,6 @@ def test_values_lie_on_the_nearest_entry_of_a_code_book(degree, tmp_path):
 
 
 def test_values_that_fit_into_a_code_book_are_exact(tmp_path):
-    """A flat white sheet of equal Gaussians: no range is empty for the writer."""
     cloud = varied_cloud(20, degree=0)
     cloud.means[:, 2], cloud.sh[:], cloud.scales[:] = 0.25, 1.0, -3.0
     export_cloud(tmp_path / "a.sog", cloud)
@@ -63,7 +62,6 @@ def test_values_that_fit_into_a_code_book_are_exact(tmp_path):
 
 
 def test_as_splat_transform_writes_it():
-    """Axes are those of the .ply. It cuts values off, and its code books are for more Gaussians than these."""
     found = in_order(read_sog(FILES / "scene.sog"), scene())
     assert_same(found, scene(), means=1.5e-4, scales=0.02, colors=0.01, sh=0.01, **CUT_OFF)
 
@@ -85,7 +83,6 @@ def test_a_folder_is_what_a_bundle_holds(tmp_path):
 
 
 def _streamed(folder, change=lambda meta: None):
-    """A streamed scene: two files for the finest level, of which a part is in no leaf, and one for the next."""
     whole = varied_cloud(30, degree=1)
     parts = {
         "0_0": whole.select(torch.arange(20)),
@@ -162,8 +159,6 @@ def _picture(width, height, value=0):
 
 
 def _set(place, value):
-    """Sets an entry of meta.json, such as `means mins`."""
-
     def change(files):
         meta = part = json.loads(files["meta.json"])
         *path, last = place.split()
@@ -230,7 +225,6 @@ def test_nothing_precedes_or_follows_a_bundle(tmp_path):
 
 
 def test_a_code_book_may_hold_what_is_no_number(tmp_path):
-    """What has it is left out, or flat."""
     export_cloud(tmp_path / "a.sog", varied_cloud())
     for place, value, words, left in (
         ("sh0 codebook", math.nan, "`f_dc_*` or `f_rest_*` is NaN or infinite", 0),
@@ -245,7 +239,6 @@ def test_a_code_book_may_hold_what_is_no_number(tmp_path):
 
 
 def test_nothing_swells(tmp_path):
-    """A bundle of a few kilobytes can hold gigabytes of zeros, and a small picture millions of pixels."""
     with zipfile.ZipFile(tmp_path / "a.sog", "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in members(FILES / "scene.sog").items():
             archive.writestr(name, content)
@@ -277,7 +270,6 @@ def test_the_mark_of_antialiasing(tmp_path):
 
 
 def test_more_harmonics_than_a_file_can_hold(tmp_path, monkeypatch):
-    """Similar ones become one: close to their noise where there are patterns, and no more sets than allowed."""
     monkeypatch.setattr(sog, "PALETTE", 1024)
     draw = seeded(1)
     cloud = varied_cloud(4000, degree=2)
@@ -304,7 +296,6 @@ def test_large_code_books_are_made_from_a_sample(monkeypatch):
 
 
 def test_sorted_along_a_curve():
-    """Neighbours in space are neighbours in the file; the Gaussians of two places do not mix."""
     cloud = varied_cloud(50, degree=0)
     far = replace(cloud, means=cloud.means + 100)
     both = together(cloud, far).select(torch.randperm(100, generator=seeded(0)))

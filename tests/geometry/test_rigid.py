@@ -25,7 +25,6 @@ def distances(place):
 
 @pytest.mark.parametrize("dt", [1e-4, 1e-2, double(0.03)])
 def test_momenta_and_distances_stay(dt):
-    """Also in turns of several degrees in a substep: the velocity leads along the chord."""
     moved = rigid_velocity(PLACE, VELOCITY, MASS, dt)
     for found, given in zip(momenta(PLACE, moved), momenta(PLACE, VELOCITY), strict=True):
         near(found, given, 1e-11)

@@ -14,5 +14,4 @@ def _leaf_area(length, width, taper=(0.55, 0.85)):
 
 @pytest.fixture
 def leaf_area():
-    """Area of the flat outline of a leaf, by its length, width and taper."""
     return _leaf_area

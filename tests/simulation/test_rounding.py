@@ -16,7 +16,6 @@ def _flag(E, dtype, wind=(6.0, 1.5, 0.0), **settings):
 
 
 def _energy(simulation, frames):
-    """Energy that nothing has put in, the work of the wind, and the number of substeps."""
     state, work, steps = simulation.start(), 0.0, 0
     for _ in range(frames):
         state, health = simulation.advance(state)

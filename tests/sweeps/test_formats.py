@@ -81,7 +81,6 @@ def test_shards(undisturbed, tmp_path):
 
 
 def _small_copy(undisturbed, folder):
-    """The record and results of a sweep, without its runs."""
     folder.mkdir()
     shutil.copy(undisturbed / "sweep.json", folder)
     shutil.copytree(undisturbed / "results", folder / "results")

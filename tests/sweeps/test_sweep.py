@@ -140,7 +140,6 @@ def test_a_stopped_sweep_ends_in_order(undisturbed, tmp_path, sweep_file, monkey
 
 
 def test_ctrl_c_of_the_terminal_is_for_the_driver_alone(tmp_path, sweep_file, monkeypatch):
-    """Workers do not hear it, not even while they import."""
     submit = run.Processes.submit
 
     def disturbed(self, job):

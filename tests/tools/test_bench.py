@@ -11,7 +11,6 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture
 def added(monkeypatch):
-    """A study that halves numbers, and fails for zero."""
     monkeypatch.setattr(runner, "STUDIES", {})
 
     @runner.study("halves", lambda device: [{"number": n, "on": device} for n in (0, 2, 3)])

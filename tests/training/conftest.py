@@ -64,7 +64,6 @@ class FlagData(lightning.LightningDataModule):
 
 @pytest.fixture
 def data():
-    """Two small sets of views, for training and validation."""
     return FlagData()
 
 

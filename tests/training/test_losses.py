@@ -63,7 +63,6 @@ def test_photometric_gradient():
 
 
 def _of_each(loss, values):
-    """The loss of each Gaussian alone."""
     return torch.stack([loss(one) for one in values.split(1)])
 
 

@@ -134,7 +134,6 @@ def filled(kind: str, head: dict[str, Any], blocks: dict[str, bytes]) -> str:
     """A page.
 
     Args:
-        kind: One of :data:`STARTS`.
         head: The head of a film, of which title and background are put in.
         blocks: What the page unpacks, by name, in the order in which it is needed.
     """
@@ -245,9 +244,6 @@ def pack_splats(film: Film, moving: bool, first: int = 0, last: int | None = Non
     """Some of the Gaussians of a film that move, or of the others, as the page reads them.
 
     Args:
-        film: The film.
-        moving: Which of the two.
-        first: The first of them.
         last: The last (excluded); all if None.
     """
     count = film.head["moving"]

@@ -90,9 +90,6 @@ class Film:
     def moved(self, frame: int) -> tuple[Tensor, Tensor]:
         """Centres and covariances in a frame, as the page draws them, without a limit of stretch.
 
-        Args:
-            frame: Its number.
-
         Returns:
             Centres, float64, shape (N, 3), and covariances, shape (N, 3, 3).
         """
@@ -139,11 +136,8 @@ def film_of(simulation: Simulation, grid: GridSpec, nodes: Tensor, displacement:
     """The film of a simulation whose nodes move.
 
     Args:
-        simulation: The simulation.
-        grid: Its grid.
         nodes: Flat indices of the nodes in the grid, rising, shape (M,).
         displacement: Their displacements [m], float32, shape (K, M, 3).
-        name: What it shows.
     """
     scene, painter = simulation.scene, simulation.painter
     camera = painter.camera_at(0)
@@ -226,10 +220,6 @@ def growth(scene: SimulatedScene, camera: Camera) -> Tensor:
     other, as in haze or in a hedge, less is enough, and the picture is drawn much faster: each becomes max(1, s g)
     times as large, where g is the root of :data:`LAYERS` per optical depth, and at most 1. The optical depth is the sum
     of the integrals of what is centred in a block of pixels, per area of the block.
-
-    Args:
-        scene: The scene, at rest.
-        camera: The first view, on the device of the scene.
     """
     means, scales = scene.model.means.detach(), in_double(scene.model.scales.detach())
     seen = means @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
@@ -294,8 +284,6 @@ def stencils_of(stencil: Stencil, grid: GridSpec, nodes: Tensor) -> tuple[Tensor
     """The places at which the motion is read, and their stencils, for a browser.
 
     Args:
-        stencil: Of the places.
-        grid: The grid.
         nodes: Flat indices of the nodes that are known, rising, shape (M,).
 
     Returns:

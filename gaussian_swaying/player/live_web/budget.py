@@ -34,11 +34,6 @@ def load_of(simulation: Simulation) -> float:
 def fitted(parser: ArgumentParser, settings: Namespace, target: str) -> tuple[Simulation, str]:
     """Choose the points and the grid for a kind of machine.
 
-    Args:
-        parser: From :meth:`Simulation.parser`.
-        settings: The settings as they are configured.
-        target: One of :data:`TARGETS`.
-
     Returns:
         The simulation, and what was chosen in words.
     """
