@@ -50,7 +50,6 @@ class Fixed:
                 setattr(cls, name, _closing(name, vars(cls)[name]))
 
     def __post_init__(self) -> None:
-        """Close a dataclass."""
         _close(self, "__post_init__", Fixed.__post_init__)
 
     def __repr__(self) -> str:
@@ -226,11 +225,9 @@ class FixedList(Fixed, nn.ModuleList):
         super().__init__(modules)
 
     def add_module(self, name: str, module: nn.Module | None) -> None:
-        """Add a module while the list is made."""
         if "_made" in vars(self):
             _refuse(self, name)
         super().add_module(name, module)
 
     def insert(self, index: int, module: nn.Module) -> None:
-        """Refuse."""
         _refuse(self, str(index))

@@ -52,9 +52,6 @@ def read_json(path: str | os.PathLike[str], what: str, largest: int = LARGEST_JS
     Args:
         what: Name of the file in the message, for example "camera file".
         largest: Largest allowed size [bytes].
-
-    Returns:
-        The parsed content.
     """
     try:
         content = check_regular(path, f"the {what}", largest).read_bytes()
@@ -133,9 +130,6 @@ def read_arrays(
 
     Args:
         what: Name of the kind of file, for the message, for example "the reference".
-
-    Returns:
-        The arrays found, by name.
     """
     try:
         path = check_archive(path, what)

@@ -62,9 +62,6 @@ def read_fields(
 
     Args:
         what: Name of the kind of file, for the message, for example "the sweep file".
-
-    Returns:
-        The given values, by name.
     """
     import yaml
 

@@ -1,5 +1,3 @@
-"""Fixtures and the rule for GPU tests."""
-
 import importlib.util
 import os
 import shutil

@@ -1,5 +1,3 @@
-"""Files that are refused before they are read."""
-
 import os
 import struct
 import zipfile

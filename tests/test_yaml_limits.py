@@ -1,5 +1,3 @@
-"""Configurations that are too much are refused before they are built, in a sentence."""
-
 import pytest
 import yaml
 from shared import refused

@@ -88,7 +88,6 @@ class Capture:
     origin: Origin = NO_ORIGIN
 
     def split(self, name: str) -> tuple[View, ...]:
-        """Views of ``train``, ``val`` or ``test``, sorted by name."""
         check_choice("name", name, SPLITS)
         return tuple(view for view in self.views if view.split == name)
 
@@ -114,9 +113,6 @@ def read_capture(
         test_every: Every n-th image, sorted by name and starting with the first, is used for testing; 0 for none. Not
             used if the capture's files define training and test images.
         images: Folder of the images of a COLMAP model.
-
-    Returns:
-        The capture.
 
     Raises:
         FileNotFoundError: If ``path`` does not exist.

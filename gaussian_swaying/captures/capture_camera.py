@@ -96,7 +96,6 @@ class CaptureCamera(CameraPath):
 
     @property
     def still(self) -> bool:  # type: ignore[override]
-        """True for one view."""
         return self.view is not None
 
     def __post_init__(self) -> None:

@@ -204,9 +204,6 @@ class GeneratedCapture:
         """Write the capture: ``images/``, ``transforms.json`` and ``mesh.ply``.
 
         Images are PNG with alpha; colours are not multiplied with it. ``transforms.json`` is written last.
-
-        Returns:
-            The folder.
         """
         from imageio.v3 import imwrite
         from plyfile import PlyData, PlyElement

@@ -39,9 +39,6 @@ def initial_points(
         count: Number of random or consistent points. All points of a capture or a file are used.
         half_side: Half the side of the cube [scene units]. The default is how far the median camera sees to each side
             of the point that all cameras look at.
-
-    Returns:
-        The points.
     """
     check_whole("count", count, 1)
     if source == "capture" or (source == "auto" and capture.points is not None):

@@ -21,11 +21,7 @@ if TYPE_CHECKING:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parse, build, run.
-
-    Returns:
-        The exit code, as from :func:`~gaussian_swaying.cli.errors.run_command`.
-    """
+    """Parse, build, run."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     parser = Simulation.parser()
     started: list[Simulation] = []

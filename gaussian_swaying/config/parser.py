@@ -366,7 +366,6 @@ class CommonHelp(Action):
         super().__init__(option_strings, dest=SUPPRESS, default=SUPPRESS, nargs=0, help=options["help"])
 
     def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
-        """Print and exit."""
         print(common_help(parser), end="")
         parser.exit()
 

@@ -331,9 +331,6 @@ class InteriorFilling:
             opacities: Opacities from 0 to 1, shape (N,).
             spacing: Side of a cell [m], used if the object has none.
             progress: Show a progress bar if it takes more than a second.
-
-        Returns:
-            Points, volumes, and which Gaussians are on the surface.
         """
         h = self.spacing if self.spacing is not None else spacing
         assert h is not None, "the scene gives its cells"

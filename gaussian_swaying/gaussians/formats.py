@@ -362,9 +362,6 @@ def export_frames(
     Args:
         path: File to write: for USD one with all frames; otherwise its name has ``#`` in place of the digits of the
             frame, counted from 0: ``frame_####.spz`` makes frame_0000.spz, frame_0001.spz, ... Its folder is made.
-
-    Returns:
-        The files.
     """
     target, format = Path(path), FORMATS[format_of(path)]
     if not format.film and "#" not in target.name:

@@ -68,9 +68,6 @@ def encode_gltf(cloud: GaussianCloud, rotation: Tensor | None = None, metres_per
     Args:
         rotation: Rotation from scene directions to z up, shape (3, 3); the scene's z is up if None.
         metres_per_unit: Length of a scene unit [m].
-
-    Returns:
-        The content of the file.
     """
     turn = _UPRIGHT if rotation is None else _UPRIGHT @ rotation.to("cpu", torch.float64)
     cloud = _moved(cloud.to("cpu", torch.float32), turn * metres_per_unit, torch.zeros(3, dtype=torch.float64))

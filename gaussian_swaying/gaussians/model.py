@@ -203,9 +203,6 @@ class GaussianSurfaceModel(Fixed, nn.Module):
             position: Deformed centres [scene units], shape (..., N, 3).
             deformation_gradient: Total deformation gradients, shape (..., N, 3, 3).
 
-        Returns:
-            Centres, covariances, normals and rotations.
-
         Raises:
             ValueError: If a tensor does not have the shape above.
         """

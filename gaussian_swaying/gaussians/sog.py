@@ -63,9 +63,6 @@ def encode_sog(cloud: GaussianCloud) -> bytes:
     """A bundle (.sog). The Gaussians are sorted along a space-filling curve, which makes the file smaller.
 
     Up to 65,536 different sets of harmonics beyond degree 0 are kept; where there are more, similar ones are averaged.
-
-    Returns:
-        The content of the file.
     """
     count = len(cloud)
     width = -(-int(np.ceil(np.sqrt(count))) // 4) * 4

@@ -87,9 +87,6 @@ def encode_spz(cloud: GaussianCloud, spz_version: int = 3) -> bytes:
     Args:
         spz_version: 3 is read by most programs; 4 needs zstandard; 1 and 2 have coarser rotations, and 1 centres in
             half precision.
-
-    Returns:
-        The content of the file.
     """
     if spz_version not in VERSIONS:
         raise ValueError(f"Expected `spz_version` to be 1, 2, 3 or 4, but got {spz_version}.")

@@ -151,7 +151,6 @@ class SimFrame:
         return eye + ((F - eye).flatten(-2) @ both).unflatten(-1, (3, 3))  # one product, not two of small matrices
 
     def describe(self) -> str:
-        """One line of text that helps to place boxes and cameras."""
         origin = [round(v, 4) for v in self.origin.tolist()]
         up = [round(v, 3) for v in self.rotation[2].tolist()]
         return f"1 scene unit = {self.metres_per_unit:.6g} m; origin {origin}; up {up} (scene units)"

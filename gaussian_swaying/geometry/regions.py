@@ -306,7 +306,6 @@ class StillGaussians(Region):
         return axes[0, :0], axes[:0]
 
     def contains(self, points: Tensor) -> Tensor:
-        """Refuse."""
         raise ValueError("StillGaussians are the shape of an obstacle, not a region.")
 
 

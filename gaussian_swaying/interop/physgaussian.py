@@ -72,7 +72,6 @@ class Fields:
         return value
 
     def whole(self, name: str, *default: int, least: int = 1) -> int:
-        """A whole number, ``least`` or larger."""
         value = self.number(name, *default)
         if value != int(value) or value < least:
             raise ValueError(
@@ -87,7 +86,6 @@ class Fields:
         return list(self._typed(name, (list, tuple), "a list", []))
 
     def vector(self, name: str, *default: Sequence[float], length: int = 3) -> tuple[float, ...]:
-        """A list of ``length`` finite numbers."""
         return check_vector(name, self.get(name, *default), length)
 
     def window(self, required: bool = True) -> dict[str, Any]:
@@ -247,7 +245,6 @@ class Turned:
     sticky: bool
 
     def vector(self, value: Sequence[float]) -> list[float]:
-        """A vector of turned axes in the axes of the simulation."""
         return tidy(self.turn @ torch.tensor(value, dtype=torch.float64))
 
 
@@ -440,7 +437,6 @@ class PhysGaussianCamera(PinholePath):
         self._model: Camera | None = None
 
     def in_space(self, frame: SimFrame) -> PhysGaussianCamera:
-        """The camera with ``viewpoint`` and ``up`` in the normalised space."""
         return changed(self, frame=frame)
 
     def eye(self, frame: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -656,11 +652,7 @@ def camera_settings(take: Fields, cameras: str | None) -> dict[str, Any]:
 
 
 def to_yaml(settings: Mapping[str, Any], notes: Iterable[str] = (), source: str | None = None) -> str:
-    """Settings as a YAML file for ``--config``, with the notes as comments at the top.
-
-    Returns:
-        The text.
-    """
+    """Settings as a YAML file for ``--config``, with the notes as comments at the top."""
     import textwrap
 
     import yaml

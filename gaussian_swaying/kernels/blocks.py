@@ -57,7 +57,6 @@ class Block:
 
     @property
     def floating(self) -> bool:
-        """True if the numbers are floating point numbers."""
         return self.kind[0] == "f"
 
 
@@ -166,7 +165,6 @@ class Emitter:
         return self.intrinsic("llvm.fptosi.sat", [block.value], to, [to, block.value.type])
 
     def splat(self, block: Block, shape: Shape) -> Block:
-        """A block repeated to a shape."""
         lanes = math.prod(shape)
         if block.lanes == lanes:
             return block if block.shape == shape else replace(block, shape=shape)
@@ -196,7 +194,6 @@ class Emitter:
         return found
 
     def matched(self, *values: Value) -> list[Block]:
-        """Blocks of one type and shape."""
         blocks = [value for value in values if isinstance(value, Block)]
         best = max(blocks, key=lambda block: ORDER.index(block.kind)) if blocks else None
         made = [self.block(value, best) for value in values]
@@ -224,7 +221,6 @@ class Emitter:
         return Block(value, block.kind, block.shape)
 
     def absolute(self, x: Block) -> Block:
-        """|x|."""
         if x.floating:
             return self.unary("fabs", x)
         return self.where(self.compare("<", x, 0), self.arithmetic("-", 0, x), x)
@@ -261,11 +257,9 @@ class Emitter:
         return Block(made, a.kind, a.shape)
 
     def negative(self, x: Block) -> Block:
-        """-x, of floating point numbers."""
         return Block(self.builder.fneg(x.value), x.kind, x.shape)
 
     def bits(self, x: Block, kind: str) -> Block:
-        """The bits of numbers as those of another type."""
         return Block(self.builder.bitcast(x.value, self.type_of(kind, x.lanes)), kind, x.shape)
 
     def _with_stride(self, made: Block, sign: str, a: Block, b: Block) -> Block:
@@ -283,7 +277,6 @@ class Emitter:
         return replace(made, first=first, stride=a.stride + (b.stride if sign == "+" else -b.stride))
 
     def compare(self, sign: str, x: Value, y: Value) -> Block:
-        """X sign y, true or false."""
         a, b = self.matched(x, y)
         if a.floating:
             make = self.builder.fcmp_unordered if sign == "!=" else self.builder.fcmp_ordered
@@ -307,7 +300,6 @@ class Emitter:
         return self.where(self.compare(">" if which == "max" else "<", a, b), a, b)
 
     def arange(self, start: int, end: int) -> Block:
-        """The integers from start to before end."""
         shape = (end - start,)
         if shape == (1,):
             return self.constant(start, "i32", shape)
@@ -315,7 +307,6 @@ class Emitter:
         return Block(value, "i32", shape, ir.Constant(TYPES["i32"], start), 1)
 
     def reduce(self, which: str, x: Block, axis: int | None = None) -> Block:
-        """``sum``, ``max`` or ``min`` over an axis, or over all."""
         if x.kind == "i1":
             x = self.convert(x, "i32")
         shape = () if axis is None else x.shape[:axis] + x.shape[axis + 1 :]
@@ -346,7 +337,6 @@ class Emitter:
         return b.extract_element(value, index(0))
 
     def running_sum(self, x: Block) -> Block:
-        """Sums of each lane and all before it."""
         if x.lanes == 1:
             return replace(x, first=None)
         value, index, b, lanes = x.value, ir.IntType(32), self.builder, x.lanes
@@ -375,7 +365,6 @@ class Emitter:
         return mask, self.common_shape(*(each.shape for each in (pointer.offset, *blocks, mask) if each is not None))
 
     def load(self, pointer: Pointer, mask: Value = None, other: Value = None) -> Block:
-        """The numbers at some addresses; ``other`` (or zero) where a mask is false."""
         kind = pointer.kind
         stored = "i8" if kind == "i1" else kind
         offset = pointer.offset
@@ -411,7 +400,6 @@ class Emitter:
         return self.convert(made, "i1") if kind == "i1" else made
 
     def store(self, pointer: Pointer, value: Value, mask: Value = None) -> None:
-        """Write numbers to some addresses, where a mask is true."""
         kind = pointer.kind
         stored = "i8" if kind == "i1" else kind
         offset = pointer.offset

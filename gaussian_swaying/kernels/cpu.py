@@ -342,12 +342,10 @@ class Noted:
 
     @property
     def key(self) -> Any:
-        """What is compiled."""
         return self.kernel, tuple(self.constants.items()), tuple(self.kinds.values()), self.real
 
     @property
     def programs(self) -> int:
-        """Number of its programs."""
         return int(math.prod(self.arguments[:3]))
 
 

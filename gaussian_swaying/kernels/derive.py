@@ -336,13 +336,11 @@ class Graph:
         return self._known[key]
 
     def argument(self, name: str, shape: Shape) -> Any:
-        """The symbols of an argument."""
         if shape == 0:
             return self.make("argument", name)
         return tuple(self.make("argument", f"{name}[{k}]") for k in range(shape))
 
     def call(self, function: Any, known: Primitive, given: tuple[Any, ...]) -> Any:
-        """The symbols of the result of a primitive."""
         whole = self.make("call", function, given)
 
         def parts(shape: Any, place: str) -> Any:

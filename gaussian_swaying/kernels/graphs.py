@@ -48,7 +48,6 @@ class Component(Fixed):
         return None
 
     def nearest_device_function(self) -> Any:
-        """The device function, or else that of the nearest base that has one."""
         own = (vars(kind).get("device_function", Component.device_function) for kind in type(self).__mro__)
         return next((one for one in own if one is not Component.device_function), Component.device_function)(self)
 
@@ -255,7 +254,6 @@ class Repeater:
         return graph
 
     def forget(self, key: Hashable | None = None) -> None:
-        """Drop the graphs of one key, or all of them."""
         for known in list(self._graphs) if key is None else [key]:
             for graph in self._graphs.pop(known, {}).values():
                 graph.reset()

@@ -100,7 +100,6 @@ class Compiler:
 
     @staticmethod
     def cdiv(x: int, y: int) -> int:
-        """X / y, rounded up."""
         return -(-x // y)
 
     @staticmethod

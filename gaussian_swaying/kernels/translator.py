@@ -77,7 +77,6 @@ class Translator(Emitter):
     def kernel(
         self, kernel: Any, constants: dict[str, Any], arguments: dict[str, str], name: str = "kernel"
     ) -> ir.Module:
-        """Add the function of a kernel to the module, under some name."""
         number = TYPES["i64"]
         kind = ir.FunctionType(ir.VoidType(), [ADDRESS, number, number])
         function = ir.Function(self.module, kind, name)

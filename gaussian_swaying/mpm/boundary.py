@@ -174,7 +174,6 @@ class ParticleBoundary(Boundary):
         self.region = region
 
     def in_frame(self, frame: SimFrame) -> Boundary:
-        """The condition with its region evaluated in metres."""
         return self.copy_in(frame)
 
     def particle_mask(self, rest_position: Tensor) -> Tensor:

@@ -387,7 +387,6 @@ class ContactRun:
         return False
 
     def due(self, steps: int) -> range:
-        """The substeps of a rollout before which lists are made."""
         self.used = min(steps, self.interval)
         return range(0, steps if self.stage.contact is not None and self.places else 0, self.interval)
 

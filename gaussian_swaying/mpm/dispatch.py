@@ -82,7 +82,6 @@ class LawDispatch:
         return wave, bound
 
     def return_map(self, F: Tensor, internal: Tensor | None, dt: float) -> tuple[Tensor, Tensor | None]:
-        """Elastic deformation gradient and internal variable after plastic flow."""
         internal = self.initial_internal() if internal is None else internal
         found = self._each("return_map", F, internal, dt)
         return found[0], found[1] if internal is not None else None

@@ -141,7 +141,6 @@ class Structure:
         return self.with_rows(self.hooke())
 
     def with_rows(self, K: Any) -> Any:
-        """A stiffness with pinned points and ties as stiff rows."""
         self.stiff = STIFF_ROW * float(abs(K.diagonal()).max())
         for _, row, _ in self.pins:
             K = K + self.stiff * (row.T @ row)

@@ -281,7 +281,6 @@ class Modes(Total):
         forces: Sequence[Force],
         watch: Callable[[int], None] | None = None,
     ) -> MPMState:
-        """Advance by several substeps; see ``MPMSolver.rollout``."""
         q, p = self.amplitudes(state)
         middle = state.time + 0.5 * dt
         groups = [self._grouped(force) for force in forces]

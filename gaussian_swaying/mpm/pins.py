@@ -889,7 +889,6 @@ class PinnedRows:
             kept += [Rows(*(field[some] for field in rows)) for some in chosen]
 
         def stacked(values: Sequence[Tensor], filling: float = 0) -> Tensor:
-            """Of all phases and scenes."""
             return _stack(values, filling).unflatten(0, (len(inverse), len(times))).transpose(0, 1).to(device)
 
         filling = (0, 0, 0, True, 0, -math.inf)

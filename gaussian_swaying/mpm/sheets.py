@@ -71,9 +71,6 @@ def flattened(F, n, mu, lam):
     Args:
         mu: Shear modulus [Pa].
         lam: First Lamé parameter [Pa].
-
-    Returns:
-        :math:`\hat F`, m, a, h and h'(a).
     """
     turned = matvec(cofactor(F), n)
     area = tl.sqrt(tl.maximum(dot3(turned, turned), _LEAST * _LEAST))

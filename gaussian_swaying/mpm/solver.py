@@ -405,9 +405,6 @@ class MPMSolver(Fixed, Solver):
                 gravity.
             margin: Extra cells on each side, for motion caused by the wind and the boundaries.
 
-        Returns:
-            The state with its new grid.
-
         Raises:
             FloatingPointError: If a position or a speed is NaN or infinite.
             ValueError: If the grid would be larger than ``MAX_NODES``.
@@ -621,9 +618,6 @@ def _check_begin(bound: Formulation, state: MPMState, dt: float, steps: int, lim
 
     Args:
         dt: Substep [s].
-
-    Returns:
-        The number of substeps as an integer of Python.
     """
     _check_state(bound, state)
     if isinstance(dt, bool) or not isinstance(dt, Real):

@@ -41,7 +41,6 @@ class GridSpec:
 
     @property
     def lattice_count(self) -> int:
-        """Number of nodes of one scene without virtual ones."""
         return self.resolution[0] * self.resolution[1] * self.resolution[2]
 
     @property
@@ -49,7 +48,6 @@ class GridSpec:
         return self.lattice_count + self.virtual
 
     def holds(self, other: GridSpec) -> bool:
-        """True if all nodes of another grid are among those of this one."""
         inside = (
             a <= b and b + m <= a + n
             for a, n, b, m in zip(self.offset, self.resolution, other.offset, other.resolution, strict=True)
@@ -88,9 +86,6 @@ def bounding_grid(low: Tensor, high: Tensor, dx: float, margin: int) -> GridSpec
         low: Smallest coordinates of the points [m], shape (3,).
         high: Largest coordinates of the points [m], shape (3,).
         dx: Grid spacing [m].
-
-    Returns:
-        The grid.
     """
     # Python integers, which do not overflow
     first = [math.floor(x) - margin for x in (low / dx - 0.5).tolist()]
@@ -379,7 +374,6 @@ class State:
         return {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
 
     def scene(self, index: int) -> Self:
-        """One scene of a batch; its tensors are views."""
         own = {k: v[index] for k, v in self.fields().items() if isinstance(v, Tensor) and k != "time"}
         if self.F_total is self.F_elastic:
             own["F_total"] = own["F_elastic"]
@@ -391,7 +385,6 @@ class State:
         return [v for k, v in self.fields().items() if isinstance(v, Tensor) and k not in without]
 
     def state_dict(self) -> dict[str, Any]:
-        """The state as plain tensors and numbers, for ``torch.save``."""
         return self.fields() | ({"F_total": None} if self.F_total is self.F_elastic else {})
 
     @classmethod

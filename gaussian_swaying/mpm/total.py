@@ -225,7 +225,6 @@ class Total(Formulation):
         return self.grid
 
     def first_state(self, velocity: Tensor, margin: int) -> MPMState:
-        """The state at time zero, with velocities interpolated from the nodes."""
         state = super().first_state(velocity, margin)
         momentum = self._summed(self.points.mass[..., None] * velocity)
         node_velocity = momentum * self.node_inverse_mass[..., None]
@@ -513,7 +512,6 @@ class TotalRun(Run):
         return self.plain and (self.touching is None or None not in self.touching.solids)
 
     def restiffen(self, bound: Total) -> None:
-        """Take a body of another stiffness; what was recorded stays."""
         self.bound = bound
         for row, values in zip(self.material[1:3], (bound.laws.mu, bound.laws.lam), strict=True):
             row.copy_(values.reshape(-1)[self.order.long()])
@@ -644,7 +642,6 @@ class TotalRun(Run):
         )  # fmt: skip
 
     def substep(self, offset: int, options: dict[str, Any]) -> None:
-        """Launch one substep, ``offset`` after the first one."""
         if self.asked:
             self._push()
         width = 8 if self.position else 4

@@ -416,7 +416,6 @@ class TotalAdjoint(TotalRun):
         checkpoint: int,
         watch: Callable[[int], None] | None,
     ) -> MPMState:
-        """As ``MPMSolver.rollout``; gradients reach nodal fields, stiffness, mass, volume, wind and coefficients."""
         if steps == 0:
             return state
         if not self.made:

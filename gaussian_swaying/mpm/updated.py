@@ -452,7 +452,6 @@ class UpdatedRun(Run):
         )
 
     def substep(self, offset: int, options: dict[str, Any]) -> None:
-        """Launch one substep, ``offset`` after the first one."""
         self._nodes(offset, options)
         if self.asked:  # the forces need the end of a substep before the next one starts
             self._particles(offset + 1, options, gather=True, scatter=False)

@@ -69,7 +69,6 @@ class Strokes:
         self.roles = self._roles_of(self.labels)
 
     def __len__(self) -> int:
-        """The number of strokes that can be taken back."""
         return len(self._past)
 
     @property
@@ -102,7 +101,6 @@ class Strokes:
         self._label(index, torch.full_like(index, place))
 
     def take_back(self) -> None:
-        """Take the last stroke back; nothing happens without one."""
         if self._past:
             last = self._past.pop()
             self.known = last.known
@@ -288,7 +286,6 @@ class Painting:
             self._show()
 
     def apply(self) -> None:
-        """Let the simulation take the parts, from rest."""
         strokes, session = self._strokes, self.session
         if strokes is None:
             return

@@ -85,7 +85,6 @@ class Panel:
         }
 
     def groups(self) -> list[dict[str, Any]]:
-        """All controls with their values, in groups, for JSON."""
         settings, model = self.session.settings, self.session.simulation.model
         flow = self._flow()
         speed, *angles = angles_of(flow)
@@ -132,7 +131,6 @@ class Panel:
         return [*found, group("Picture", picture, True)]
 
     def names(self) -> dict[str, dict[str, Any]]:
-        """The controls by their names."""
         return {control["name"]: control for part in self.groups() for control in part["controls"]}
 
     def set(self, name: str, value: Any) -> None:

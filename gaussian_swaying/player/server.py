@@ -189,7 +189,6 @@ class Client:
 
     @property
     def rate(self) -> float:
-        """Pictures that it shows a second, as it said within the last seconds."""
         rate, said = self._rate
         return rate if time.monotonic() - said < RECENT else 0.0
 
@@ -198,7 +197,6 @@ class Client:
         self._taken, self._rate = int(count), (min(max(float(rate), 0.0), 1000.0), time.monotonic())
 
     async def say(self, told: Mapping[str, Any] | bytes) -> None:
-        """Send a message; one with bytes is to be confirmed."""
         self._sent += isinstance(told, bytes)
         if isinstance(told, bytes):
             await self.connection.send_bytes(told)
@@ -258,7 +256,6 @@ class Server:
     # ---- from any thread
 
     def show(self, session: Session) -> Server:
-        """Show a session; returns the server."""
         self.panel, self.painting = Panel(session), Painting(session, self.scratch)
         self.session = session
         self.progress(None)

@@ -400,7 +400,6 @@ class Session:
         return config_text(self.parser, self.settings)
 
     def rate(self) -> float:
-        """Simulated seconds per second, lately."""
         steps, now = list(self._steps), time.perf_counter()
         steps = [step for step in steps if now - step[0] < WINDOW]
         if len(steps) < 2:
@@ -496,7 +495,6 @@ class Session:
                 self._wake.wait_for(lambda: self._closed or self._busy(), due - now)
 
     def pace(self, speed: float) -> None:
-        """Set the wanted speed, in simulated seconds per second."""
         with self._wake:
             self.speed, self._anchor = max(float(speed), 1e-3), None
 

@@ -26,9 +26,6 @@ def read_checkpoint(path: Path, config: str = "") -> dict[str, Any]:
 
     Args:
         config: The configuration with which it must have been written; "" for any.
-
-    Returns:
-        Its fields.
     """
     if not path.exists():
         raise ValueError(f"There is nothing to resume in {path.parent}: it has no {path.name}; leave out --resume.")

@@ -120,7 +120,6 @@ class FrameWriter:
             self._hire()
 
     def wait(self) -> None:
-        """Wait until no job is pending."""
         with self._changed:
             while self._jobs:
                 self._hire()

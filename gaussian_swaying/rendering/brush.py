@@ -45,9 +45,6 @@ def seen(means: Tensor, covariances: Tensor, camera: Camera, picture: RenderOutp
         covariances: Their covariances [scene units²], shape (N, 3, 3).
         picture: A picture of them from there, which may have fewer pixels.
         slack: See there [scene units].
-
-    Returns:
-        All on the CPU.
     """
     pixel, depth = project(means, camera)
     size = torch.tensor([camera.width, camera.height])

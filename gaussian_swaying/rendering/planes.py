@@ -77,9 +77,6 @@ def surface_maps(channels: Tensor, alpha: Tensor, camera: Camera, least_alpha: f
     Args:
         channels: Blended channels, shape (H, W, 4).
         alpha: Rendered opacity, shape (H, W, 1).
-
-    Returns:
-        The maps, differentiable where a surface is.
     """
     check_shape("channels", channels, camera.height, camera.width, 4)
     check_shape("alpha", alpha, camera.height, camera.width, 1)

@@ -706,9 +706,6 @@ def with_parts(scene: Scene, cloud: GaussianCloud, material: Material, solver: S
     Args:
         material: Its ``regions`` come after those of the parts, and win.
         solver: Gets a body for each part that is rigid, and a pin for all that are held, which holds nodes of the grid.
-
-    Returns:
-        Copies.
     """
     parts = scene.parts
     if parts is None:
@@ -1100,9 +1097,6 @@ def surface_of(samples: Samples, owner: Tensor, points: MaterialPoints, dx: floa
         owner: A material point close to each, shape (N,).
         dx: Grid spacing [m].
         contact: Contact of the surface with itself; None if only obstacles count.
-
-    Returns:
-        The surface, in the precision of the points.
     """
     chosen = (samples.surface & (samples.body_area > 0)).nonzero()[:, 0]
     part = samples.choose(chosen)
@@ -1256,9 +1250,6 @@ def body_of(
         normals: Their unit normals, shape (N, 3).
         dx: Length that the solver resolves [m].
         labels: The part of each Gaussian, shape (N,), if the scene has parts.
-
-    Returns:
-        The body.
     """
     position = frame.point_to_sim(part.means.double())
     source = torch.arange(len(position))  # the Gaussian of each sample of the surface
@@ -1649,9 +1640,6 @@ class SimulatedScene(nn.Module):
             state: State of one scene, fields of shape (P, ·).
             rotations: Whether to compute the rotations; otherwise they are those at rest, which is enough for colours
                 that are the same from every direction.
-
-        Returns:
-            All Gaussians, the static ones at rest.
         """
         rest, index = self.rest(), self.moving
         parts: dict[str, Any] = self.moved(state, rotations)

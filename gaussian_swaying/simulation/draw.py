@@ -651,9 +651,6 @@ class Frame:
 
         Args:
             camera: Name of one of ``cameras``; empty for the main ``camera``.
-
-        Returns:
-            Colour, opacity and depth.
         """
         painter, gaussians = self.painter, self.gaussians
         if camera and camera not in painter.cameras:

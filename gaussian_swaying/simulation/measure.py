@@ -210,7 +210,6 @@ class Measurement:
         return self._scene(0) if self._scenes == 1 else _joined([self._scene(k) for k in range(self._scenes)])
 
     def each(self) -> tuple[FrameDiagnostics, ...]:
-        """The measurements of each scene; substeps and Courant number are those of all."""
         self._wait()
         return tuple(self._scene(k) for k in range(self._scenes))
 
@@ -454,9 +453,6 @@ def advice(found: Mapping[str, Any], E: float, thickness_matters: bool = True) -
 
     Args:
         E: Largest Young's modulus of the run [Pa].
-
-    Returns:
-        The sentences.
     """
     low, high = SOUND
     small, large, moved = found["compressed"], found["stretched"], found["moved"]

@@ -550,9 +550,6 @@ class Simulation(Fixed):
             state: The current state.
             edits: The changes, in this order.
 
-        Returns:
-            The state from which the run continues.
-
         Raises:
             ValueError: If a region contains nothing, or a plastic law is used in the ``total`` formulation.
         """
@@ -632,9 +629,6 @@ def run_batch(
 
     Args:
         folders: Folder of each; None for one that is only simulated.
-
-    Returns:
-        The summaries.
     """
     batch = members[0].batch([member.model for member in members])
     state = batch.start()

@@ -220,7 +220,6 @@ class Stepper:
 
     @property
     def scene(self) -> SimulatedScene:
-        """Gaussians, material points and patches."""
         return self.model.scene
 
     @property
@@ -234,7 +233,6 @@ class Stepper:
 
     @property
     def wind_force(self) -> WindForce:
-        """The wind on the patches of the scene, or of all scenes."""
         first = self.models[0]
         parts = (first.aero, first.scene.patches, *(model.wind for model in self.models))
         if self._wind_force is None or any(a is not b for a, b in zip(self._wind_force[0], parts, strict=True)):
@@ -359,7 +357,6 @@ class Stepper:
 
     @in_turn
     def start(self) -> State:
-        """The state at rest at time zero."""
         self.starts += 1
         if isinstance(self.solver, MPMSolver):
             self.solver.choose(anew=True)
@@ -420,7 +417,6 @@ class Stepper:
         return True
 
     def bind(self) -> State:
-        """Bind the solver to the material; returns the state at rest."""
         scene, self._bound = self.scene, self.materials
         points = MaterialPoints.stack(self._bound) if self.batched else self._bound[0]
         state: State = self.solver.init_state(points, frame=scene.frame, surface=scene.surface_places)
@@ -501,11 +497,6 @@ class Stepper:
 
     @in_turn
     def advance(self, state: State) -> tuple[State, FrameDiagnostics]:
-        """Advance by one frame.
-
-        Returns:
-            The state at its end, and its diagnostics.
-        """
         return self.launch(state).finish()
 
     @in_turn
@@ -701,7 +692,6 @@ class Launched:
 
     @property
     def each(self) -> tuple[FrameDiagnostics, ...]:
-        """The diagnostics of each scene of a batch, when it is finished."""
         return self._measurement.each()
 
     def _launch(self, margin: int) -> tuple[State, Measurement]:
@@ -840,7 +830,6 @@ class SceneEditor:
 
     @property
     def scene(self) -> SimulatedScene:
-        """The scene as it is now."""
         return self.stepper.scene
 
     def start(self) -> State:
@@ -855,11 +844,7 @@ class SceneEditor:
         return self.stepper.start()
 
     def edit(self, state: State, edits: Sequence[Edit]) -> State:
-        """Apply edits now, whatever their time; if one is not possible, nothing changes.
-
-        Returns:
-            The state from which the run continues.
-        """
+        """Apply edits now, whatever their time; if one is not possible, nothing changes."""
         before = self.stepper.model, self.unedited, self.version
         try:
             return self._go_on(state, edits)
@@ -923,7 +908,6 @@ class SceneEditor:
         return particles, gaussians
 
     def reset(self) -> None:
-        """Restore the scene as it was before its first edit."""
         self.applied = 0
         if self.unedited is not None:
             scene, self.unedited = self.unedited.to(self.stepper.device), None
@@ -937,7 +921,6 @@ class SceneEditor:
         return found
 
     def apply(self, edits: Sequence[Edit], flowed: bool = False, running: bool = False) -> State | None:
-        """Apply edits to the scene."""
         scene = self.scene
         if edits and self.unedited is None:
             self.unedited = scene

@@ -69,7 +69,6 @@ class Kind:
 
     @property
     def cloth(self) -> bool:
-        """True for a sheet, which is simulated by material points."""
         return self.frequency is None
 
 
@@ -107,9 +106,6 @@ def kind_of(own: Gaussians, up: Array, end: str, sheet: bool, names: list[str], 
 
     Args:
         end: Where it is held: ``top``, ``bottom``, ``side`` or ``none``.
-
-    Returns:
-        The name of the kind, and why, in words.
     """
     height, wide = own.means @ up, breadth(own.means, up, 0.02)
     low, high = corners(height)

@@ -102,7 +102,6 @@ class Thing:
 
     @property
     def score(self) -> float:
-        """How likely it is to be what should move."""
         return round(sum(self.reasons.values()), 2)
 
 

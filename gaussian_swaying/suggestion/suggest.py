@@ -101,9 +101,6 @@ def suggest(
         device: Of the simulation.
         tune: Whether stiffness, mass and drag are made those of its kind, which takes seconds; if not, they are first
             guesses.
-
-    Returns:
-        The suggestion.
     """
     begin = Stopwatch()
     path = None if isinstance(splat, GaussianCloud) else Path(splat).resolve()

@@ -125,7 +125,6 @@ class Suggestion:
 
     @property
     def fixed(self) -> bool:
-        """True if something holds it."""
         return self.pin is not None or self.parts is not None
 
     @property
@@ -146,7 +145,6 @@ class Suggestion:
 
     @property
     def why_formulation(self) -> str:
-        """The reason why it sways by modes or by material points, in words."""
         if self.by_modes:
             how = "turns as one" if self.kind == "hanging" else "leans by less than 40 %"
             return f"it is held, nothing touches, and it {how}"
@@ -158,7 +156,6 @@ class Suggestion:
 
     @property
     def reasons(self) -> dict[str, str]:
-        """What was guessed and why, in sentences by name."""
         return reasons_of(self)
 
     def picture(self, height: int = 540) -> Array:
@@ -171,7 +168,6 @@ class Suggestion:
         return None if self.place is None else things_picture(self.cloud, self.place, self.moves, device)
 
     def to_simulation(self, device: str = "auto") -> Simulation:
-        """The simulation."""
         parser = Simulation.parser()
         with TemporaryDirectory() as folder:
             text = self.to_yaml(Path(folder) / "starter.yaml", splat=self.path or Path("splat.ply"))
@@ -188,9 +184,6 @@ class Suggestion:
         Args:
             file: The configuration; Gaussians without a file of their own are written beside it.
             splat: The file of the Gaussians that it names; ``path`` if None.
-
-        Returns:
-            Its text.
         """
         folder = Path(file).resolve().parent
         splat = splat or self.path

@@ -48,9 +48,6 @@ def write_shards(
     Args:
         output: Folder of the files; ``shards`` in the folder of the sweep if None.
 
-    Returns:
-        The files.
-
     Raises:
         ValueError: If the folder is not a sweep, none of its runs is complete, or something was not recorded.
     """
@@ -129,9 +126,6 @@ def write_contact_sheets(folder: Path, picture: str = "last") -> list[Path]:
 
     Args:
         picture: Frame to show, ``last`` or ``middle``.
-
-    Returns:
-        The files.
     """
     runs = read_record(folder)["runs"]
     files = []

@@ -46,11 +46,7 @@ SUMMARY = (*FIGURES, *(f"{name}_end_J" for name in ENERGIES), "warnings")
 
 
 def open_folder(folder: Path, plan: Plan, resume: bool, together: int = 1) -> FolderLock:
-    """Make and lock the folder of a sweep, or lock the one that is continued.
-
-    Returns:
-        The lock, to be released at the end.
-    """
+    """Make and lock the folder of a sweep, or lock the one that is continued."""
     held = (folder / SWEEP).exists()
     if resume and not held:
         raise ValueError(f"There is nothing to resume in {folder}: it has no {SWEEP}; leave out --resume.")

@@ -88,7 +88,6 @@ class Job:
 
     @property
     def wanted(self) -> tuple[str, ...]:
-        """Names of the runs without the complete ones."""
         return tuple(name for name in self.names if name not in self.complete)
 
     def apart(self) -> list[Job]:
@@ -284,7 +283,6 @@ class Processes:
         self._places: dict[Future[Outcome], int] = {}
 
     def submit(self, job: Job) -> Future[Outcome]:
-        """See ``Pool.submit``."""
         place = self._free.pop(0)
         if place not in self._executors:
             environment = {"OMP_NUM_THREADS": str(self.threads), "GOMP_SPINCOUNT": os.getenv("GOMP_SPINCOUNT", "3000")}
@@ -301,7 +299,6 @@ class Processes:
         return future
 
     def outcome(self, job: Job, future: Future[Outcome]) -> Outcome:
-        """See ``Pool.outcome``."""
         place = self._places.pop(future)
         self._free.insert(0, place)
         try:
@@ -318,12 +315,10 @@ class Processes:
         return outcome
 
     def close(self) -> None:
-        """See ``Pool.close``."""
         for executor in self._executors.values():
             executor.shutdown()
 
     def stop(self) -> None:
-        """See ``Pool.stop``; an impatient second Ctrl-C kills them."""
         try:
             for executor in self._executors.values():
                 for process in list(executor._processes.values()):
@@ -396,14 +391,12 @@ class Ray:
         self._references: dict[Future[Outcome], Any] = {}
 
     def submit(self, job: Job) -> Future[Outcome]:
-        """See ``Pool.submit``."""
         reference = self._task.options(name=f"run {job.names[0]}", **self._options).remote(job, *self._given)
         future: Future[Outcome] = reference.future()
         self._references[future] = reference
         return future
 
     def outcome(self, job: Job, future: Future[Outcome]) -> Outcome:
-        """See ``Pool.outcome``."""
         del self._references[future]
         try:
             return future.result()
@@ -412,7 +405,6 @@ class Ray:
             return _lost(job, f"Ray ended its process ({told}): use fewer `--workers` if it was memory, or --resume.")
 
     def stop(self) -> None:
-        """See ``Pool.stop``."""
         try:
             for reference in self._references.values():
                 self._ray.cancel(reference)
@@ -421,7 +413,6 @@ class Ray:
             self.close()
 
     def close(self) -> None:
-        """See ``Pool.close``."""
         if self._ours:
             self._ray.shutdown()
 

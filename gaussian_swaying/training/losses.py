@@ -29,9 +29,6 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2, pa
         target: Photo, of the same shape.
         ssim_weight: Weight w of the structural part, 0 to 1.
         padding: See :func:`ssim_map`. With ``valid``, each part is the mean over the pixels that it is defined for.
-
-    Returns:
-        A number.
     """
     difference = (image - target).abs().mean()
     if ssim_weight == 0.0:
@@ -322,16 +319,13 @@ class TotalLoss(nn.Module):
         self.terms = nn.ModuleDict(self._by_name)
 
     def active(self, step: int) -> dict[str, LossTerm]:
-        """The terms that are computed at a step, by name."""
         return {name: term for name, term in self._by_name.items() if term.share(step)}
 
     def needs(self, step: int) -> frozenset[str]:
-        """Return the inputs that the active terms need, see :data:`NEEDS`."""
         wanted: frozenset[str] = frozenset()
         return wanted.union(*(term.needs for term in self.active(step).values()))
 
     def forward(self, inputs: LossInputs) -> tuple[Tensor, Mapping[str, Tensor]]:
-        """The sum, with its gradient, and each active term before its weight, detached."""
         terms = self.active(inputs.step)
         values = {name: term(inputs) for name, term in terms.items()}
         for name, value in values.items():

@@ -219,9 +219,6 @@ class SplatTrainer(lightning.LightningModule):
             background: Colour behind them, shape (3,); black when None.
             degree: Degree of the harmonics in use; all when None.
             surface: Whether to blend the channels that :func:`~gaussian_swaying.rendering.planes.surface_maps` needs.
-
-        Returns:
-            The picture.
         """
         splat = self.splat
         degree = self.sh_degree if degree is None else degree

@@ -111,7 +111,6 @@ class ComputedAir(Fixed, nn.Module):
         return max(b - a for a, b in zip(self.low, self.high, strict=True)) / self.cells
 
     def counts(self) -> tuple[int, int, int]:
-        """Cells along x, y and z, with those within the ground."""
         sides = [math.ceil((b - a) / self.spacing - 1e-6) for a, b in zip(self.low, self.high, strict=True)]
         return sides[0], sides[1], sides[2] + self.ground
 

@@ -229,7 +229,6 @@ class CarriedField(Tabulated):
     start: Tensor
 
     def along(self, flow: Tensor) -> WindEffect:
-        """The field with its x axis turned into the flow."""
         return changed(self, axes=box_axes(flow.detach().cpu(), (self.sizes * self.step).tolist(), self.tilted))
 
     def now(self, moment: Moment) -> Tensor:

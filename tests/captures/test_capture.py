@@ -1,5 +1,3 @@
-"""Captures in every format, against the cameras and pictures that were written."""
-
 import json
 import math
 from contextlib import nullcontext

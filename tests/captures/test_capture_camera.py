@@ -1,5 +1,3 @@
-"""Cameras of a capture as camera paths: both kinds of files give the same."""
-
 import json
 import math
 

@@ -1,5 +1,3 @@
-"""Distortion against its definition: inverse, picture of a known scene, the largest rectangle."""
-
 from dataclasses import replace
 
 import pytest

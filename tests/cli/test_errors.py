@@ -1,5 +1,3 @@
-"""One place turns errors into a sentence and an exit code."""
-
 import os
 import re
 import subprocess

@@ -1,5 +1,3 @@
-"""The command line of the converter."""
-
 import pytest
 import torch
 from shared import refused

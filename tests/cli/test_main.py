@@ -1,5 +1,3 @@
-"""The installed program, and configurations by name."""
-
 import os
 import runpy
 import subprocess

@@ -1,5 +1,3 @@
-"""The command line: what it accepts, and the one sentence it answers bad input with."""
-
 import json
 import os
 import re

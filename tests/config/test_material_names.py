@@ -1,5 +1,3 @@
-"""`material: cotton` in a YAML, on the command line and in Python."""
-
 import pytest
 from shared import refused, up_to, value_error
 

@@ -1,5 +1,3 @@
-"""Simulation as users meet it in Python and in a YAML: short forms, frames, winds, gradients, several together."""
-
 import pytest
 import torch
 from shared import beyond, in_both, near, peak, up_to, user_warning, value_error

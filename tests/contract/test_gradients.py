@@ -1,5 +1,3 @@
-"""Gradients of a simulation: those of its constructor's tensors are right, and none is lost without a word."""
-
 import pytest
 import torch
 from shared import double, near, up_to, value_error

@@ -1,5 +1,3 @@
-"""Examples of README and pages print what they show; commands are the promised ones."""
-
 import json
 import re
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""Comparing folders whose differences are known."""
-
 import json
 import math
 

@@ -1,5 +1,3 @@
-"""Areas of patches: each alone by its formula, together against the true area of the surface."""
-
 import math
 
 import pytest

@@ -1,5 +1,3 @@
-"""Splats in the formats of web viewers, read again."""
-
 import numpy as np
 import pytest
 import torch

@@ -1,5 +1,3 @@
-"""What is attached to what in a splat."""
-
 import math
 
 import pytest

@@ -1,5 +1,3 @@
-"""Files for viewers: what is left out of them, films, and names; test_compact.py reads what gsplat wrote."""
-
 import math
 from dataclasses import replace
 

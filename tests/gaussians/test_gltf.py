@@ -1,5 +1,3 @@
-"""glTF with KHR_gaussian_splatting: as it was, as others write it, nodes and number types, and what is refused."""
-
 import base64
 import json
 import math

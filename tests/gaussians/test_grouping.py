@@ -1,5 +1,3 @@
-"""Groups of points for a grid, and specks that hang on nothing."""
-
 import pytest
 import torch
 from shared import longest, rand, seeded

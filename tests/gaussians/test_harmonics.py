@@ -1,5 +1,3 @@
-"""Spherical harmonics against associated Legendre polynomials, and their rotation against turned directions."""
-
 import math
 
 import pytest

@@ -1,5 +1,3 @@
-"""Gaussians of a part, from a seed."""
-
 import dataclasses
 
 import pytest

@@ -1,5 +1,3 @@
-"""How open patches are: the weighted areas add up to the outer skin, and free sheets keep theirs."""
-
 import dataclasses
 import math
 

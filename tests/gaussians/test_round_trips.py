@@ -1,5 +1,3 @@
-"""Every format, written and read again: as it was within the bits of each field."""
-
 import math
 import re
 import tracemalloc

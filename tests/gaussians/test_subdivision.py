@@ -1,5 +1,3 @@
-"""Further points on large Gaussians."""
-
 import math
 
 import pytest

@@ -1,5 +1,3 @@
-"""Covariances: from scales and quaternions and back, deformed, and limited in stretch."""
-
 import pytest
 import torch
 from shared import EYE, double, gradients, near, randn, unit

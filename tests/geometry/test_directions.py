@@ -1,5 +1,3 @@
-"""Lines over all directions, and the area of a convex hull from the shadows that it throws."""
-
 import math
 
 import pytest

@@ -1,5 +1,3 @@
-"""Signed distances of solids, against brute force and exact values."""
-
 import math
 import os
 

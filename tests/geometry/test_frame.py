@@ -1,5 +1,3 @@
-"""Scene units to metres and back, against closed forms."""
-
 import dataclasses
 
 import pytest

@@ -1,5 +1,3 @@
-"""The neighbour search against all distances."""
-
 import pytest
 import torch
 from shared import peak, randn

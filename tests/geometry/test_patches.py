@@ -1,5 +1,3 @@
-"""Normals and areas of patches against mapped planes and inverses, in torch and in the kernel."""
-
 import pytest
 import torch
 from shared import EYE, alike, double, gradients, near, rand, randn, unit

@@ -1,5 +1,3 @@
-"""Regions and the choice of what is simulated."""
-
 import copy
 
 import pytest

@@ -1,5 +1,3 @@
-"""The motion of a rigid body from the momentum of its points."""
-
 import pytest
 import torch
 from shared import double, near, peak, rand, randn, seeded

@@ -1,5 +1,3 @@
-"""README names files and numbers that exist, and every page is linked."""
-
 import json
 import re
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""The site is built without a warning, and its reference has a complete entry for each public name."""
-
 import ast
 import html
 import importlib

@@ -1,5 +1,3 @@
-"""Kernels that are compiled for this processor: the cache on disk, threads, and recordings."""
-
 import importlib
 import os
 import shutil

@@ -1,5 +1,3 @@
-"""Device functions on tensors and on symbols, and those that are derived from them."""
-
 import pytest
 import torch
 from shared import double, rand, randn, seeded

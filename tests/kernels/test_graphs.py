@@ -1,5 +1,3 @@
-"""What a CUDA graph may record, and when a recorded one no longer holds."""
-
 import copy
 
 import pytest

@@ -1,5 +1,3 @@
-"""Launches on the device of the tensors, and what can be launched where."""
-
 import importlib.util
 
 import pytest

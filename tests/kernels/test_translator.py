@@ -1,5 +1,3 @@
-"""Statements, functions and errors of the translator, in small kernels."""
-
 import inspect
 import re
 

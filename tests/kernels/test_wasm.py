@@ -1,5 +1,3 @@
-"""Noted launches of a CPU as WebAssembly, in Node.js, and as shaders."""
-
 import subprocess
 from functools import partial
 

@@ -1,5 +1,3 @@
-"""Chamfer distance against brute force and closed forms."""
-
 import pytest
 import torch
 from shared import value_error

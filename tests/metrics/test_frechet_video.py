@@ -1,5 +1,3 @@
-"""Fréchet distance on Gaussians with a known one, and on videos with a network whose features are known."""
-
 import hashlib
 import math
 

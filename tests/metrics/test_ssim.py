@@ -1,5 +1,3 @@
-"""Structural similarity against torchmetrics."""
-
 import torch
 from shared import rand, value_error
 from torch.testing import assert_close

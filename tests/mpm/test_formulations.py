@@ -1,5 +1,3 @@
-"""The two formulations against each other, with every law, and what each of them does not support."""
-
 from importlib import import_module
 from pkgutil import iter_modules
 

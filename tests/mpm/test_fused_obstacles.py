@@ -1,5 +1,3 @@
-"""Obstacles in the kernels against torch."""
-
 import pytest
 import torch
 from catalogue import OBSTACLES

@@ -1,5 +1,3 @@
-"""Gradients through whole substeps: every input against finite differences."""
-
 import pytest
 import torch
 from shared import EYE, ZERO, beyond, double, peak, rand, randn, seeded, solid

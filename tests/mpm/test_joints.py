@@ -1,5 +1,3 @@
-"""Joints between points: forces of a rigid motion, momenta, closed forms, and how stiff a spring may be."""
-
 import math
 
 import pytest

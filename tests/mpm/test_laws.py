@@ -1,5 +1,3 @@
-"""Laws: energy, stress, return maps and bounds on the stiffness of each, and closed forms of single ones."""
-
 import math
 import re
 from functools import partial

@@ -1,5 +1,3 @@
-"""The `modes` formulation against `total`, exact energies, and what it refuses."""
-
 import math
 
 import pytest

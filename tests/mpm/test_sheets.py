@@ -1,5 +1,3 @@
-"""Sheets of one layer that bend by an energy of their own."""
-
 import dataclasses
 
 import pytest

@@ -1,5 +1,3 @@
-"""Whole steps of both formulations against exact solutions."""
-
 import dataclasses
 
 import pytest

@@ -1,5 +1,3 @@
-"""Particle-grid transfers against the conservation laws that define APIC."""
-
 import subprocess
 import sys
 

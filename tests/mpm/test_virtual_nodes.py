@@ -1,5 +1,3 @@
-"""Copies of nodes for parts that only lie close to each other."""
-
 import dataclasses
 
 import pytest

@@ -1,5 +1,3 @@
-"""A small flag, and a session of it."""
-
 import asyncio
 import json
 import threading

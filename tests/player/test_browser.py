@@ -1,5 +1,3 @@
-"""The live page draws in a real browser, from the states that it gets."""
-
 import numpy as np
 import pytest
 import torch

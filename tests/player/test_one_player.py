@@ -1,5 +1,3 @@
-"""One player with three sources: a film, the live page, and a page that simulates."""
-
 import pytest
 import torch
 import yaml

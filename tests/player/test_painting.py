@@ -1,5 +1,3 @@
-"""Parts that are painted on the live page."""
-
 import numpy as np
 import pytest
 import torch

@@ -1,5 +1,3 @@
-"""The panel of the live page: what its controls show, and what they change in the session."""
-
 import pytest
 import yaml
 from browsers import until

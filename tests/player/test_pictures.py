@@ -1,5 +1,3 @@
-"""Pictures from the camera of a browser, picking, and their size."""
-
 import math
 from functools import partial
 

@@ -1,5 +1,3 @@
-"""A simulation that goes on in a thread, and is changed there."""
-
 import dataclasses
 import math
 import threading

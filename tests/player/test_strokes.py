@@ -1,5 +1,3 @@
-"""Labels that are painted, and go back."""
-
 import torch
 
 from gaussian_swaying.gaussians.parts import ROLES, Part, Parts

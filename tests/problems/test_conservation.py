@@ -1,5 +1,3 @@
-"""What whole steps of a free body conserve: momenta, affine motion, and the same answer wherever it lies."""
-
 import dataclasses
 
 import pytest

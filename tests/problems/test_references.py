@@ -1,5 +1,3 @@
-"""The references of known answers, beside numbers that were computed by other means."""
-
 import math
 
 import pytest

@@ -1,5 +1,3 @@
-"""Solver and wind law together, against closed forms."""
-
 import math
 
 import pytest

@@ -1,5 +1,3 @@
-"""Shared by the tests of cameras."""
-
 import pytest
 import torch
 

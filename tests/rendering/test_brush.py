@@ -1,5 +1,3 @@
-"""The Gaussians that a brush touches, against plain loops over all of them."""
-
 import itertools
 import math
 

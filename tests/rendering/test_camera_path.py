@@ -1,5 +1,3 @@
-"""The camera of each frame of a run."""
-
 import json
 import math
 

@@ -1,5 +1,3 @@
-"""The gsplat renderer against the torch renderer."""
-
 import math
 import sys
 import threading

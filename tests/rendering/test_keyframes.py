@@ -1,5 +1,3 @@
-"""Camera paths given by keys."""
-
 import math
 from itertools import pairwise
 

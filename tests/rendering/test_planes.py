@@ -1,5 +1,3 @@
-"""Normals, plane distances and depths of a rendered surface."""
-
 import math
 
 import pytest

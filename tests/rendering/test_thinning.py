@@ -1,5 +1,3 @@
-"""Thinned Gaussians look like all of them; what is large enough is drawn as it is."""
-
 import math
 
 import pytest

@@ -1,5 +1,3 @@
-"""The colours of roles."""
-
 import torch
 
 from gaussian_swaying.gaussians.parts import ROLES

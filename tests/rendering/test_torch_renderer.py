@@ -1,5 +1,3 @@
-"""The torch renderer against a loop over pixels and Gaussians written from the equations."""
-
 import math
 
 import pytest

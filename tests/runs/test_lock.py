@@ -1,5 +1,3 @@
-"""One writer per folder, however two of them meet."""
-
 import gc
 import os
 import subprocess

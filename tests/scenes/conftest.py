@@ -1,5 +1,3 @@
-"""What a leaf should measure."""
-
 import math
 
 import pytest

@@ -1,5 +1,3 @@
-"""The generated flag against the sheet it stands for."""
-
 import math
 
 import pytest

@@ -1,5 +1,3 @@
-"""The generated scenes: what they hold, that they repeat, and what they refuse."""
-
 import math
 
 import pytest

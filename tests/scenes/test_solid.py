@@ -1,5 +1,3 @@
-"""Generated solids: on their surface, with true normals, solid if asked."""
-
 import math
 
 import pytest

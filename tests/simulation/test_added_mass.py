@@ -1,5 +1,3 @@
-"""Air that a sheet carries along: inertia without weight in everything that a stepper does."""
-
 import math
 
 import pytest

@@ -1,5 +1,3 @@
-"""Scenes in which only what is connected along its surface shares nodes."""
-
 import dataclasses
 
 import pytest

@@ -1,5 +1,3 @@
-"""Contact and obstacles in the front door and in a configuration."""
-
 import dataclasses
 import warnings
 

@@ -1,5 +1,3 @@
-"""Numbers of known states, and who is to blame for bad ones."""
-
 import itertools
 import math
 

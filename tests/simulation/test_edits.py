@@ -1,5 +1,3 @@
-"""Material and colour of a part of the object, changed at load and during a run."""
-
 import dataclasses
 
 import numpy as np

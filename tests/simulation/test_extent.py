@@ -1,5 +1,3 @@
-"""Sizes that make no sense are refused, odd ones are warned of."""
-
 import torch
 from shared import user_warning, value_error
 

@@ -1,5 +1,3 @@
-"""Parts of a splat that a joint connects: what hangs on it stays there and turns."""
-
 import dataclasses
 
 import torch

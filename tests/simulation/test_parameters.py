@@ -1,5 +1,3 @@
-"""Parameters: each is read and written in one place, a number of a user's own force too."""
-
 import json
 import math
 import sys

@@ -1,5 +1,3 @@
-"""Several cameras and several renders in one run."""
-
 import imageio.v3 as iio
 import numpy as np
 import pytest

@@ -1,5 +1,3 @@
-"""Very stiff material in the wind: how much energy rounding adds, and where it is refused."""
-
 import torch
 from shared import up_to, value_error
 

@@ -1,5 +1,3 @@
-"""Groups of samples."""
-
 import dataclasses
 
 import pytest

@@ -1,5 +1,3 @@
-"""The Gaussians that move, their weight, and how they follow the material."""
-
 import dataclasses
 import math
 

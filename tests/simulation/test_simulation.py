@@ -1,5 +1,3 @@
-"""Frames from components: substeps, wind, cameras, colours and pictures."""
-
 import copy
 import dataclasses
 import json

@@ -1,5 +1,3 @@
-"""Filled solids in a run: what they weigh, where the wind acts, and that nobody sees the filling."""
-
 import dataclasses
 import math
 from pathlib import Path

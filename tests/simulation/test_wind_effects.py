@@ -1,5 +1,3 @@
-"""Winds with effects in a simulation: places in scene units, shelter in every frame, resuming, and the YAML."""
-
 import pytest
 import torch
 from shared import double, waits

@@ -1,5 +1,3 @@
-"""The wind in pictures."""
-
 from dataclasses import replace
 
 import imageio.v3 as iio

@@ -1,5 +1,3 @@
-"""The estimate of a run's time, against made-up clocks."""
-
 from types import SimpleNamespace
 
 import pytest

@@ -1,5 +1,3 @@
-"""What cameras tell about a splat: up, the object, a wall or floor behind it."""
-
 import math
 
 import numpy as np

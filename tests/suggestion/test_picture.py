@@ -1,5 +1,3 @@
-"""The picture of a suggestion, its camera, and its configuration."""
-
 import json
 
 import numpy as np

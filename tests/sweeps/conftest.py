@@ -1,5 +1,3 @@
-"""Sweeps of tiny flags: as a file, done once without disturbance, and with workers that are killed."""
-
 import multiprocessing
 from functools import partial
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""The table as Parquet, and the runs as WebDataset shards, read back."""
-
 import json
 import shutil
 import tarfile

@@ -1,5 +1,3 @@
-"""Sweeps on Ray: a local cluster of two nodes on one machine."""
-
 import json
 import os
 import signal

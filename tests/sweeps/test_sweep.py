@@ -1,5 +1,3 @@
-"""Whole sweeps with worker processes: disturbed ones end as undisturbed ones, and failures stop nothing."""
-
 import errno
 import json
 import os

@@ -1,5 +1,3 @@
-"""What tests of the tools share."""
-
 import importlib
 import importlib.util
 import sys

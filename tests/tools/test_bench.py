@@ -1,5 +1,3 @@
-"""Studies, their records, and the sections of the pages."""
-
 import json
 from pathlib import Path
 

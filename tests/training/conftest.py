@@ -1,5 +1,3 @@
-"""A flag seen from a few cameras, in memory."""
-
 import lightning
 import pytest
 import torch

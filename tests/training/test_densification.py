@@ -1,5 +1,3 @@
-"""The strategies of gsplat on a model, its optimiser and their state."""
-
 import pytest
 import torch
 from shared import seeded, value_error

@@ -1,5 +1,3 @@
-"""Trainings that learn, stop when something is not finite, and continue exactly."""
-
 import math
 
 import lightning

@@ -1,5 +1,3 @@
-"""Panels."""
-
 import torch
 from shared import near
 from torch.testing import assert_close

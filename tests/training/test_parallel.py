@@ -1,5 +1,3 @@
-"""Training on several devices: the images are shared, the gradients averaged, and there is one splat."""
-
 import os
 import socket
 import subprocess

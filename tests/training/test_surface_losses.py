@@ -1,5 +1,3 @@
-"""Losses of the surface on views whose surface is known."""
-
 import math
 from dataclasses import replace
 from functools import cache

@@ -1,5 +1,3 @@
-"""Computed air around a sheet: momentum, energy, masses, what it costs, and what is refused."""
-
 import math
 
 import pytest

@@ -1,5 +1,3 @@
-"""Profiles, plumes, flow round bodies and shelter, against closed forms and measurements."""
-
 import math
 import re
 from importlib import import_module

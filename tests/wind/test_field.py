@@ -1,5 +1,3 @@
-"""The wind is a function of time and seed, and its statistics are what they say."""
-
 import math
 from copy import deepcopy
 

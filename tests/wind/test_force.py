@@ -1,5 +1,3 @@
-"""The wind law against its closed forms and symmetries."""
-
 import math
 
 import pytest

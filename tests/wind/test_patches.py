@@ -1,5 +1,3 @@
-"""The wind on groups of patches equals the sum over their patches."""
-
 import math
 
 import pytest

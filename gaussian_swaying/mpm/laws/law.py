@@ -191,13 +191,11 @@ class DeviceLaw:
 
     @cached_property
     def free(self) -> bool:
-        """Whether the energy needs neither numbers of the law nor an internal variable."""
         used = uses(self.energy, _STRETCHED) if self.energy else uses(self.strain_energy, _STRAINED)
         return not used & {"internal", "p"}
 
     @cached_property
     def density(self) -> Any:
-        """Energy density from F."""
         return self.strain_energy or _spectral_energy(self.energy)
 
 

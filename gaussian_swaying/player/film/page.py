@@ -44,9 +44,6 @@ def write_film(run: Path, target: Path) -> Film:
     Args:
         run: The output folder of ``gaussian-swaying sim``.
         target: The file; its name ends in .html for a page, or in .sway for the film alone (docs/bundle.md).
-
-    Returns:
-        The film.
     """
     bundle = target.suffix == ".sway"
     if not bundle:

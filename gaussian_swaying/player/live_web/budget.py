@@ -32,11 +32,7 @@ def load_of(simulation: Simulation) -> float:
 
 
 def fitted(parser: ArgumentParser, settings: Namespace, target: str) -> tuple[Simulation, str]:
-    """Choose the points and the grid for a kind of machine.
-
-    Returns:
-        The simulation, and what was chosen in words.
-    """
+    """Choose the points and the grid for a kind of machine."""
     configured, budget = float(settings.solver.dx), TARGETS[target]
     made: dict[float, Simulation] = {}
 

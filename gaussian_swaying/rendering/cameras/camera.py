@@ -145,9 +145,6 @@ def look_at_camera(
         near: Near plane [scene units]; :data:`NEAR` of the distance when None.
         dtype: Precision of the matrices; the default precision of torch when None.
 
-    Returns:
-        The camera.
-
     Example:
         >>> look_at_camera((0, -2, 0), (0, 0, 0), (0, 0, 1), 40.0, 480, 270).position[1]
         tensor(-2.)
@@ -209,9 +206,6 @@ def orbit_camera(
         height: Image height [pixels].
         near: Near plane [scene units]; :data:`NEAR` of the distance when None.
         dtype: Precision of the matrices; the default precision of torch when None.
-
-    Returns:
-        The camera.
     """
     check_positive("radius", radius)
     check_elevation("elevation_degrees", elevation_degrees)

@@ -24,9 +24,6 @@ def interpolate_keys(times: Sequence[float], values: Sequence[Sequence[float]], 
         times: Increasing times [s], K of them.
         time: Time [s].
 
-    Returns:
-        D numbers.
-
     Example:
         >>> interpolate_keys([0.0, 2.0], [[0.0], [8.0]], 0.5)
         [1.25]

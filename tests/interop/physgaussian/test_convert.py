@@ -1,5 +1,3 @@
-"""PhysGaussian's configurations against what its code does with them."""
-
 import json
 import math
 import re

@@ -1,5 +1,3 @@
-"""Each boundary acts only where and when it should."""
-
 import copy
 import dataclasses
 import math

@@ -1,5 +1,3 @@
-"""Pins hold points, faces or nodes: where, which bodies, in which windows, with which impulses and gradients."""
-
 import dataclasses
 import math
 import warnings

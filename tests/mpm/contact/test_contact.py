@@ -1,5 +1,3 @@
-"""Sheets that touch each other and themselves: nothing passes through, momentum stays, piles rest."""
-
 from dataclasses import replace
 
 import pytest

@@ -1,5 +1,3 @@
-"""Obstacles against closed forms: sliding, resting, draping, pushing, and the momentum that they take."""
-
 import math
 
 import pytest

@@ -1,5 +1,3 @@
-"""One width of the kernels for all bodies."""
-
 import pytest
 
 from gaussian_swaying.mpm import total

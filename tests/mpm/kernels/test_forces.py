@@ -1,5 +1,3 @@
-"""Wind, custom forces and their device functions in the fused substep."""
-
 import pytest
 import torch
 from catalogue import ELASTIC, PLASTIC

@@ -1,5 +1,3 @@
-"""Buffers of the fused substep, what it refuses, where the kernels are used, what they measure, and boundaries."""
-
 import dataclasses
 import gc
 import math

@@ -1,5 +1,3 @@
-"""Rollouts of the fused substep: changing substeps, looks on the way, graphs and their memory."""
-
 import gc
 import math
 from functools import partial

@@ -1,5 +1,3 @@
-"""A small flag, recorded as a run."""
-
 import dataclasses
 
 import pytest

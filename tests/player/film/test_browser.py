@@ -1,5 +1,3 @@
-"""A film in a real browser."""
-
 import base64
 import json
 import re

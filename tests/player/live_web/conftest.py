@@ -1,5 +1,3 @@
-"""Small simulations, and the solver of a browser in Node.js."""
-
 import json
 import subprocess
 

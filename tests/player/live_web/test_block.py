@@ -1,5 +1,3 @@
-"""The solver in a browser, in Node.js, against the package's own run."""
-
 import hashlib
 from dataclasses import replace
 

@@ -1,5 +1,3 @@
-"""The longest substep of a page, against what grows."""
-
 import pytest
 import torch
 from shared import seeded

@@ -1,5 +1,3 @@
-"""The solver in compute shaders, on an adapter in software, against the package's own run."""
-
 import base64
 
 import pytest

@@ -1,5 +1,3 @@
-"""A generated capture as training data: drawn once, never over something else."""
-
 import json
 import shutil
 
