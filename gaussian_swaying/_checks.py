@@ -47,7 +47,7 @@ def requires_grad(value: Any) -> bool:
 
 
 def check_plain(name: str, value: Any) -> None:
-    """Raise ValueError if a value that becomes plain numbers, or one of its items, requires a gradient."""
+    """Raise ValueError if a value that becomes plain numbers, or an item of it, requires a gradient."""
     items = value if isinstance(value, Iterable) and not isinstance(value, Tensor | str | bytes) else [value]
     if any(map(requires_grad, items)):
         raise ValueError(
@@ -80,7 +80,7 @@ def check_vector(name: str, value: Any, length: int = 3) -> tuple[float, ...]:
 
 
 def check_sense(name: str, value: float, least: float = 1e-12) -> None:
-    """Raise ValueError unless a finite number lies in the range in which a setting of its name makes sense."""
+    """Raise ValueError unless a finite number lies in the sensible range of the setting of that name."""
     sense = sense_of(name)
     known = sense or Sense(low=least)
     if value and not known.low <= (value if sense else abs(value)) <= known.high:

@@ -26,7 +26,7 @@ _changes = count(1)
 
 
 def count_change(thing: Any) -> None:
-    """Mark an object as changed, so that what was recorded of it is recorded again."""
+    """Count a change of an object, so that recordings of it become invalid."""
     vars(thing)["_changed"] = next(_changes)
 
 
@@ -150,13 +150,13 @@ def _check(thing: Any, name: str, *value: object) -> None:
 
 
 def fields_of(kind: type) -> list[str]:
-    """The arguments of the constructor of a class, or for a user's own class of that of the package below it."""
+    """Constructor arguments of a class; for a user's class, those of its base in the package."""
     ours = next(c for c in kind.__mro__ if _ours(c) or c is object)
     return list(inspect.signature(ours.__init__).parameters)[1:]  # type: ignore[misc]
 
 
 def described(thing: Any) -> str:
-    """The class of an object, and those of its arguments that are not the default."""
+    """Class name and non-default arguments of an object."""
     shown = []
     for name, argument in inspect.signature(type(thing).__init__).parameters.items():
         text = _brief(getattr(thing, name, None))
@@ -188,7 +188,7 @@ def _refuse(thing: Any, name: str) -> NoReturn:
 
 
 def assign(thing: Any, **values: Any) -> None:
-    """Assign to a fixed object, for the code that answers for it."""
+    """Set attributes of a fixed object. The caller must keep everything that depends on them consistent."""
     made = getattr(thing, "__dict__", {}).pop("_made", None)
     try:
         for name, value in values.items():
@@ -200,7 +200,7 @@ def assign(thing: Any, **values: Any) -> None:
 
 
 def changed(thing: T, **values: Any) -> T:
-    """A copy with other attributes; its other parts are shared. Numbers replace the content of a buffer."""
+    """A copy with other attributes that shares all other parts. A number is copied into its buffer."""
     other = copy.copy(thing)
     made = getattr(other, "__dict__", {}).pop("_made", None)  # a new object, which no recording knows
     if isinstance(thing, nn.Module):

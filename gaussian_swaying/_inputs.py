@@ -63,7 +63,7 @@ def read_json(path: str | os.PathLike[str], what: str, largest: int = LARGEST_JS
 
 
 def decoded(content: bytes) -> str:
-    """The text of a file in UTF-8, or in UTF-16 if it begins with the mark of that, without its byte order mark."""
+    """Text of a file in UTF-8, or in UTF-16 with a byte order mark."""
     wide = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
     return content.decode("utf-16" if wide else "utf-8-sig")
 
@@ -100,7 +100,7 @@ def check_archive(path: str | os.PathLike[str], what: str) -> Path:
 
 @contextmanager
 def spare_memory(amount: int) -> Iterator[None]:
-    """Let compressed files take so many bytes of memory within the block, besides a multiple of their size."""
+    """Within the block, compressed files may take this much memory [bytes] besides a multiple of their size."""
     token = _SPARE.set(amount)
     try:
         yield

@@ -151,7 +151,7 @@ def look(moments: Tensor, area: Tensor, place: Tensor, kind: Tensor) -> tuple[Te
 
 
 def values_at(field: Tensor, place: Tensor, kind: Tensor) -> Tensor:
-    """Values at points of a field of three numbers for each cell, (3, X, Y, Z), as :func:`look`; shape (P, 3)."""
+    """Interpolate a vector field (3, X, Y, Z) at points, as :func:`look` does the velocity; shape (P, 3)."""
     return _read(field, field.new_zeros(len(place)), field.new_zeros(kind.numel()), place, kind)[0]
 
 

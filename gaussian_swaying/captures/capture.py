@@ -276,7 +276,7 @@ def _turned(views: Sequence[View], unsure: Sequence[int], points: PointCloud | N
 
 
 def nearest_to_axes(cameras: Sequence[Camera]) -> Tensor:
-    """The point with the smallest sum of squared distances to all optical axes.
+    """The point closest to all optical axes, by least squares.
 
     Returns:
         The point [scene units], float64, shape (3,); NaN if the axes are parallel.
@@ -291,7 +291,7 @@ def nearest_to_axes(cameras: Sequence[Camera]) -> Tensor:
 
 
 def axes_meet_behind(cameras: Sequence[Camera]) -> bool:
-    """Whether the optical axes meet in one point that is behind all cameras."""
+    """True if all optical axes meet in one point behind the cameras."""
     focus = nearest_to_axes(cameras)
     local = [camera.world_to_camera[:3].double() @ torch.cat([focus, focus.new_ones(1)]) for camera in cameras]
     return all(bool(place[:2].norm() < -0.1 * place[2]) for place in local)

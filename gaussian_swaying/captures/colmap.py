@@ -38,7 +38,7 @@ _READABLE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
 
 def colmap_models(path: Path) -> list[tuple[Path, int]]:
-    """The folders below a capture with sparse models, and the number of images of each; that with most comes first.
+    """Folders of sparse models below a capture, with their numbers of images, the largest first.
 
     Models are in ``sparse`` or ``colmap/sparse``, in numbered folders there, or in the folder itself.
     """

@@ -78,7 +78,7 @@ def photos_below(folder: Path) -> list[Path]:
 
 
 def photos_beside(folder: Path, used: Iterable[Path], masks: Iterable[Path | None]) -> list[Path]:
-    """Photos in the same folders as those of a capture, which it does not have.
+    """Photos in the folders of a capture that the capture does not list.
 
     Pictures made of a photo do not count: their names begin with its name, as ``r_0_depth_0001.png`` with ``r_0``.
     """
@@ -97,7 +97,7 @@ def photos_beside(folder: Path, used: Iterable[Path], masks: Iterable[Path | Non
 
 
 def is_turned(size: tuple[int, int], orientation: int, wanted: tuple[float, float]) -> bool | None:
-    """Whether a camera describes a photo turned as its EXIF tag says; None if sizes do not tell.
+    """Whether a camera describes the photo as rotated by its EXIF tag; None if sizes do not tell.
 
     Args:
         size: Width and height of the pixels in the file.
@@ -112,5 +112,5 @@ def is_turned(size: tuple[int, int], orientation: int, wanted: tuple[float, floa
 
 
 def turned_size(size: tuple[int, int], orientation: int) -> tuple[int, int]:
-    """Width and height after the turn of an EXIF tag."""
+    """Width and height after the rotation of an EXIF tag."""
     return size[::-1] if orientation >= 5 else size

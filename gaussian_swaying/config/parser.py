@@ -131,7 +131,7 @@ def _parser_class() -> type[ArgumentParser]:
 
 
 def with_lists(arguments: Sequence[str]) -> list[str]:
-    """A command line with brackets round numbers with commas between them, as a shell such as zsh eats brackets.
+    """A command line with brackets round comma-separated numbers, as shells such as zsh eat brackets.
 
     Example:
         >>> with_lists(["--wind.flow", "-8,0,0", "--region.min=null,0,1e-1"])

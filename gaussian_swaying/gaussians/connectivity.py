@@ -147,7 +147,7 @@ def _missing(where: Tensor, pairs: Tensor, labels: Tensor, to: Sequence[int | No
 
 
 def pieces(cell: Tensor, pairs: Tensor) -> tuple[Tensor, Tensor]:
-    """Pieces of what is attached within cells.
+    """Connected pieces of Gaussians within each cell.
 
     Args:
         cell: A number for the cell of each Gaussian, from 0 on, shape (N,).

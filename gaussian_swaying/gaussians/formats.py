@@ -79,11 +79,11 @@ class Format:
 
     @property
     def in_metres(self) -> bool:
-        """Whether it says which way is up and how long a unit is."""
+        """True if the format stores the up direction and the length of a unit."""
         return "rotation" in self.options
 
     def losses(self, cloud: GaussianCloud, **options: object) -> list[str]:
-        """What a file will not hold, with the number of Gaussians: a part of a sentence for each kind."""
+        """What a file of this format will lose of a cloud, with counts: one phrase per kind."""
         told, count, cloud = list[str](), len(cloud), cloud.to("cpu", torch.float32)
         low, high, most, faintest = self.small, self.large, self.harmonics, self.faintest
         thin, wide = cloud.scales.amin(-1), cloud.scales.amax(-1)
@@ -225,7 +225,7 @@ FORMATS: dict[str, Format] = {
 
 
 def endings(written: bool = False) -> dict[str, str]:
-    """The formats of files that are read, or written, by the endings of their names."""
+    """Readable, or with ``written`` writable, formats by the endings of their names."""
     return {
         ending: name
         for name, format in FORMATS.items()
@@ -387,5 +387,5 @@ def export_frames(
 
 
 def numbered(name: str, number: str) -> str:
-    """A name with a number, filled up with zeros, in place of each row of ``#``."""
+    """Replace the ``#`` of a name by a number padded with zeros."""
     return re.sub("#+", lambda digits: number.rjust(len(digits[0]), "0"), name)

@@ -187,7 +187,7 @@ def hold_option(end: str, sideways: Sequence[float]) -> str:
 
 
 def columns(flat: Array, cell: float) -> Array:
-    """A number for the column of cells in which each place (N, 2) lies."""
+    """Number of the grid column of each place (N, 2)."""
     index = np.floor(flat / cell).astype(np.int64)
     return index[:, 0] * 2**31 + index[:, 1]
 
@@ -203,7 +203,7 @@ def _touched(points: Array, left_out: Array, outward: Array, cell: float) -> boo
 
 
 def given_hold(end: str, up: Sequence[float]) -> Guess:
-    """A given end: ``top``, ``bottom``, ``none``, or the axis ``+x`` to ``-z`` that points to it."""
+    """The end that an option names: ``top``, ``bottom``, ``none``, or the axis ``+x`` to ``-z`` towards it."""
     check_choice("--hold", end, ("top", "bottom", "none", *DIRECTIONS))
     if end in DIRECTIONS:
         return Guess("side", DIRECTIONS[end])
@@ -235,7 +235,7 @@ def end_region(points: Array, direction: Sequence[float], cell: float) -> Region
 
 
 def slab(centre: Array, normal: Array, start: float, size: tuple[float, float], cell: float) -> Cylinder:
-    """A cylinder around a point along a normal that begins at an offset, of a radius and a height [scene units]."""
+    """A cylinder along a normal, from an offset on, with ``size`` its radius and height [scene units]."""
     radius, height = rounded(size, cell)
     centre = centre + (start + 0.5 * size[1] - centre @ normal) * normal
     return Cylinder(rounded(centre, cell), [round(float(c), 6) for c in normal], radius, height)

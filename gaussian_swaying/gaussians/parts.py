@@ -162,7 +162,7 @@ class Parts(Fixed):
                 )
 
     def attached_to(self) -> list[int | None] | None:
-        """For each part the only other part to which its material is attached, as its place, or None for any.
+        """For each part the index of the only part it may attach to; None for any.
 
         It is the part itself where it has a joint. None if no part names another.
         """

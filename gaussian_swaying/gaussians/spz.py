@@ -120,7 +120,7 @@ def encode_spz(cloud: GaussianCloud, spz_version: int = 3) -> bytes:
 
 
 def fraction_bits(farthest: float) -> int:
-    """Bits behind the binary point of a centre, of which the largest coordinate allows so many."""
+    """Fractional bits of a centre's fixed-point number, given the largest coordinate."""
     return 24 if farthest == 0 else min(24, int(np.floor(np.log2((2**23 - 1) / farthest))))
 
 

@@ -46,7 +46,7 @@ class SimFrame:
 
     @property
     def turns(self) -> bool:
-        """True if the axes differ from those of the scene, which is so unless z is up in the scene."""
+        """True if scene axes and simulation axes differ, that is, unless z is up in the scene."""
         if not self._turns:
             self._turns.append(not torch.equal(self.rotation, torch.eye(3).to(self.rotation)))
         return self._turns[0]

@@ -271,7 +271,7 @@ class EmbeddedInGrid(EmbeddedPoints):
 
 
 def embedded_stencil(place: Tensor, grid: GridSpec, nodes: Tensor | None = None) -> Stencil:
-    """The stencil of embedded (M, 3) [m], as that of the material in ``total``."""
+    """The interpolation stencil of embedded points at places (M, 3) [m]."""
     return bspline_stencil(place, grid, moments=False, snap=torch.finfo(place.dtype).eps ** 0.5, nodes=nodes)
 
 

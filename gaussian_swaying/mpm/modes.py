@@ -246,7 +246,7 @@ class Modes(Total):
         return self.shown(state, torch.zeros_like(p), p)
 
     def shown(self, state: MPMState, q: Tensor, p: Tensor) -> MPMState:
-        """The state with nodes and points where amplitudes and their rates, shape (..., M), place them."""
+        """The state whose nodes and points follow from modal amplitudes and their rates, shape (..., M)."""
         shift = _vectors(self.shape, torch.stack([q, p], -1))
         turn = _vectors(self.turn, q[..., None])[..., 0]
         moved = torch.cat([warped(turn, shift[..., 0]), _turned(rotation_of(turn), shift[..., 1])], -1)

@@ -113,7 +113,7 @@ class Solver(nn.Module, ABC):
         """Compile what is needed; its errors are raised here."""
 
     def restiffen(self, youngs_modulus: Tensor, poisson_ratio: Tensor) -> bool:
-        """Give the material another stiffness, while a motion goes on.
+        """Change the stiffness of the material during a motion.
 
         Args:
             youngs_modulus: Young's modulus [Pa], shape (..., P).

@@ -173,7 +173,7 @@ class Measurement:
         self._found: dict[str, list[Any]] = {}
 
     def again(self, substeps: int, values: Tensor) -> Measurement:
-        """The same measurements of another frame, with its numbers in the order of ``values``."""
+        """A copy for another frame, with new ``values`` in the same order."""
         new = copy.copy(self)
         new._substeps, new.values, new._found = substeps, values, {}
         return new

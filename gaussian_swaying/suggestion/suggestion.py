@@ -198,7 +198,7 @@ class Suggestion:
 
 
 def reasons_of(s: Suggestion) -> dict[str, str]:
-    """What was guessed and why, in sentences by name; what follows a semicolon is a further reason."""
+    """What was guessed and why: sentences by name. Further reasons follow a semicolon."""
     moving, held = s.moving, s.hold
     region = "all of space" if moving.box is None else json.dumps(dict(zip(("min", "max"), moving.box, strict=True)))
     found = {

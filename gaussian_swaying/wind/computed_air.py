@@ -143,7 +143,7 @@ class AirPush(Force):
         self.numbers[:, 3] = rate
 
     def written(self) -> None:
-        """Tell who keeps a copy of the numbers that they changed: a replayed graph writes them unseen."""
+        """Bump the version of ``numbers``, which a replayed graph changes without torch's knowledge."""
         torch.autograd.graph.increment_version(self.numbers)
 
     def taken(self, way: Tensor, faster: Tensor, substeps: int, dt: float) -> Tensor:

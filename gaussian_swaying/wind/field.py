@@ -467,7 +467,7 @@ class WindField(Fixed, nn.Module):
         return self.shaped(self(time), position, Moment(time, self.mean_flow(time), self.carried(time)))
 
     def shaped(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
-        """Return the velocity at some places: the effects applied to one that is the same everywhere.
+        """Apply the effects to a uniform velocity at some places.
 
         Args:
             velocity: Velocity with modulations [m/s], shape (3,).

@@ -588,9 +588,8 @@ class WindForce(Force):
         normal: Unit normals of the patches at rest, one for each particle, shape (..., P, 3); or any number of
             :class:`~gaussian_swaying.wind.patches.Patches`, those of the scenes of a batch one after the other.
         area: Their areas at rest [m²], shape (..., P); zero for particles that feel no wind. None with ``Patches``.
-        places: Where copies of an object stand in one wind, each simulated as if it stood at the place of the original:
-            a module with ``turn``, the rotations to the axes of the wind, shape (B, 3, 3), ``shift`` [m], shape (B, 3),
-            and ``delay`` of the wind [s], shape (B,).
+        places: Positions of copies, which are simulated at the place of the original: a module with ``turn``, rotations
+            to the axes of the wind, shape (B, 3, 3), ``shift`` [m], shape (B, 3), and ``delay`` [s], shape (B,).
 
     Attributes:
         normal: Unit normals at rest, shape (..., P, 3).

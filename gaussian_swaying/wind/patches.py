@@ -117,7 +117,7 @@ class PatchSums(nn.Module):
         return torch.stack([first, count], -1).to(self.tensor)
 
     def table(self) -> Tensor:
-        """For each point two rows with the six numbers of its tensor, and a row for each vector; shape (4 rows,)."""
+        """Patch sums for the kernels: per point two rows for its tensor, then one per vector; shape (4 rows,)."""
         first = self.lists()[:, 0].long()
         found = self.tensor.new_zeros(self.rows, 4)
         upper = self.tensor[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]

@@ -128,7 +128,7 @@ HINTS = {
 
 
 def filled(kind: str, head: dict[str, Any], blocks: dict[str, bytes]) -> str:
-    """A page.
+    """An HTML page: the player with its data.
 
     Args:
         head: The head of a film, of which title and background are put in.

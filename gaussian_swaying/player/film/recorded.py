@@ -311,7 +311,7 @@ def _steps(values: Tensor, grain: int = 1) -> np.ndarray:
 
 
 def first_view(simulation: Simulation) -> dict[str, Any]:
-    """The first camera of a run: eye, point on its axis nearest to the object, field of view [degrees]; and a metre."""
+    """The first camera (eye, target, vertical field of view [degrees], aspect), and a metre in sizes of the object."""
     scene, camera = simulation.scene, simulation.painter.camera_at(0)
     size = scene.size * scene.frame.metres_per_unit
     eye = scene.frame.point_to_sim(in_double(camera.position)) / size
