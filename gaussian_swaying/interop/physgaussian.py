@@ -27,12 +27,12 @@ from gaussian_swaying.simulation.model import CENTER, rotation_matrix
 
 
 def tidy(vector: Tensor) -> list[float]:
-    """Numbers without round-off from a rotation, and without -0."""
+    """Round numbers from a rotation, without -0."""
     return [round(v, 12) + 0.0 for v in vector.tolist()]
 
 
 def heading(rotation: Tensor) -> Tensor:
-    """Turned axes to the axes of the simulation, which differ by a rotation about z; shape (3, 3), float64."""
+    """Rotation about z from turned axes to those of the simulation; shape (3, 3), float64."""
     return rotation_from_z(tidy(rotation[2])).T @ rotation.T
 
 
@@ -228,7 +228,7 @@ _HOLDS = "holds the nodes that its particles touch; PhysGaussian only sets the v
 
 @dataclass(frozen=True)
 class Turned:
-    """Values that boundaries need.
+    """The normalised space of a PhysGaussian configuration, as its boundaries need it.
 
     Args:
         turn: Rotation from turned to simulation axes, shape (3, 3).
@@ -606,7 +606,7 @@ _FILLING_NOTES = {
 
 
 def filling_settings(take: Fields, n_grid: int, grid_lim: float) -> dict[str, Any]:
-    """``scene.filling``: another method for the same purpose, on a grid with the same spacing."""
+    """``scene.filling`` for PhysGaussian's particle filling: another method, on a grid with the same spacing."""
     spacing = grid_lim / take.whole("n_grid", 4 * n_grid)
     wanted = take.whole("max_partciels_per_cell", 1)
     count = next((n for n in (1, 8) if wanted <= n), 27)

@@ -80,7 +80,7 @@ Value = Any
 
 
 def is_number(value: Value) -> bool:
-    """True if a value is a number that is known when the kernel is translated."""
+    """True if a value is a number known at translation."""
     return isinstance(value, (bool, int, float))
 
 
@@ -182,7 +182,7 @@ class Emitter:
     @staticmethod
     @lru_cache(maxsize=4096)
     def common_shape(*shapes: Shape) -> Shape:
-        """The shape to which blocks are repeated before an operation."""
+        """The shape to which the blocks of an operation are broadcast."""
         rank = max(map(len, shapes))
         padded = [(1,) * (rank - len(shape)) + shape for shape in shapes]
         found = tuple(max(sizes) for sizes in zip(*padded, strict=True))
@@ -251,7 +251,7 @@ class Emitter:
         return self._with_stride(made, sign, a, b) if sign in "+-*" and a.lanes > 1 else made
 
     def rounded(self, sign: str, x: Value, y: Value) -> Block:
-        """A sum, product or quotient that is rounded as written: no part of it is fused with another."""
+        """A sum, product or quotient without FMA contraction."""
         a, b = self.matched(x, y)
         made = {"+": self.builder.fadd, "*": self.builder.fmul, "/": self.builder.fdiv}[sign](a.value, b.value)
         return Block(made, a.kind, a.shape)
@@ -446,7 +446,7 @@ class Emitter:
         return self.intrinsic(f"llvm.masked.{what}", arguments, to, types)
 
     def atomic(self, operation: str, pointer: Pointer, value: Value, mask: Value = None) -> Block:
-        """Add to a number in memory, or make it as large, one lane after the other; returns what it was before."""
+        """Atomic ``add`` or ``max`` on memory, lane after lane; returns the old values."""
         block = self.convert(self.block(value), pointer.kind)
         mask, shape = self._where(pointer, mask, block)
         b, index = self.builder, ir.IntType(32)

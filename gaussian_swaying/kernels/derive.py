@@ -41,7 +41,7 @@ class TraceError(ValueError):
 
 @dataclass(frozen=True)
 class Primitive:
-    """What is known of a device function that is called as a whole.
+    """Known facts about a device function that is called as a whole.
 
     Attributes:
         outputs: Shape of its result: 0 for a number, n for a tuple of n, a tuple of shapes for several.
@@ -79,7 +79,7 @@ _REAL: ContextVar[torch.dtype] = ContextVar("real", default=torch.float32)
 
 
 def primitive(function: Any, outputs: Any = 0, **known: Any) -> None:
-    """Say what is known of a device function, see :class:`Primitive`."""
+    """Register known facts about a device function, see :class:`Primitive`."""
     _PRIMITIVES[function] = Primitive(outputs, **known)
 
 
@@ -87,7 +87,7 @@ def primitive(function: Any, outputs: Any = 0, **known: Any) -> None:
 
 
 def on_tensors(function: Any, look_in: bool = False) -> Callable[..., Any]:
-    """The Python function of a device function: takes and returns tensors, numbers or symbols, and tuples of them.
+    """Run a device function in Python, on tensors, numbers or symbols, and tuples of them.
 
     Constants are plain numbers and tuples. Tensors must broadcast; results have their type, device and gradient.
 
@@ -284,7 +284,7 @@ def _graph_of(*values: Any) -> Graph | None:
 
 
 class Symbol:
-    """A number that is not known yet: what it is computed from."""
+    """An unknown number: an operation and its arguments."""
 
     __slots__ = ("args", "graph", "index", "op")
 
@@ -318,7 +318,7 @@ for _op, _name in {"<": "lt", "<=": "le", ">": "gt", ">=": "ge", "==": "eq", "!=
 
 
 class Graph:
-    """All symbols of a trace; equal ones are one."""
+    """All symbols of a trace; equal symbols are shared."""
 
     def __init__(self) -> None:
         self._known: dict[tuple[Any, ...], Symbol] = {}
@@ -412,7 +412,7 @@ def _simplified(op: str, args: tuple[Any, ...]) -> Any:
 
 
 def gradient(outputs: Sequence[Any], inputs: Any, bars: Sequence[Any] | None = None) -> Any:
-    """Gradients of the sum of some numbers, times ``bars``, by the symbols of ``inputs``, in their structure."""
+    """Gradients of the sum of some numbers, weighted with ``bars``, by the symbols ``inputs``, in their structure."""
     order = _order(outputs)
     bar: dict[Any, Any] = {}
     calls: dict[Symbol, dict[str, Any]] = {}
@@ -708,7 +708,7 @@ def vjp(function: Any, shapes: dict[str, Shape], by: Sequence[str], constants: d
 
 
 def uses(function: Any, shapes: dict[str, Shape]) -> set[str]:
-    """Names of the arguments that the result of a device function depends on."""
+    """Names of the arguments that affect the result of a device function."""
     graph = Graph()
     result = on_tensors(function)(**{key: graph.argument(key, shape) for key, shape in shapes.items()})
     return {node.args[0].split("[")[0] for node in _order([result]) if node.op == "argument"}
@@ -727,7 +727,7 @@ class _Unknown(Symbol):
 
 
 def canonical(function: Any) -> str:
-    """What a device function computes, with its arguments by number: the same text for the same formula.
+    """A canonical text of a device function: the same for the same formula, whatever its names.
 
     Raises:
         TraceError: If it cannot be traced.

@@ -44,7 +44,7 @@ class Component(Fixed):
             cls.device_function = Component.device_function  # type: ignore[method-assign]
 
     def device_function(self) -> Any:
-        """The ``DeviceFunction``; None for a component that runs in torch only. Cheap: numbers are taken later."""
+        """The ``DeviceFunction``, with numbers read lazily; None if the component runs in torch only."""
         return None
 
     def nearest_device_function(self) -> Any:
@@ -53,7 +53,7 @@ class Component(Fixed):
 
 
 def recorded_key(modules: Sequence[nn.Module]) -> tuple[object, ...]:
-    """What a recording of modules depends on: other objects, addresses of tensors or settings need another recording.
+    """Key of a recording of modules; it changes with their objects, tensor addresses and settings.
 
     What is in the tensors is read at each replay. An assignment to a module that is no ``Fixed`` is not detected, nor
     one within another object.
@@ -75,7 +75,7 @@ def _parts(modules: Iterable[nn.Module]) -> Iterator[nn.Module]:
 
 
 class Replayed:
-    """Calls a function of tensors, and replays it from a CUDA graph from the second call in a row with the same key on.
+    """Calls a function of tensors; from the second consecutive call with the same key on, replays a CUDA graph.
 
     Many small kernels take longer to start than to run. Only the last recording is kept.
     """
@@ -93,7 +93,7 @@ class Replayed:
     def __call__(
         self, key: Hashable, function: Callable[..., Sequence[torch.Tensor]], *inputs: torch.Tensor
     ) -> list[torch.Tensor]:
-        """The results of the function, in tensors of their own.
+        """The results of the function, as new tensors.
 
         Args:
             key: Identifies all else that the function depends on, besides its inputs.

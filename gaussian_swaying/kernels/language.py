@@ -29,7 +29,7 @@ class Constant:
 
 
 class Name:
-    """A name of the language, such as ``load`` or ``PropagateNan.ALL``, which only the translator understands."""
+    """A name of Triton's language, such as ``load``, that only the translator understands."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -90,7 +90,7 @@ class Language:
 
 
 class Compiler:
-    """As ``triton``, as far as kernel files and those that launch them need it."""
+    """Stand-in for ``triton``, as far as this package needs it."""
 
     language = Language()
 

@@ -336,7 +336,7 @@ class ContactRun:
         return max(1, min(room, needed, int(kernels.MOST_PROGRAMS.value)))
 
     def take_room(self, room: int, slots: int) -> None:
-        """Make the buffers whose size depends on how crowded the surface is; if they are refused, the old ones stay."""
+        """Allocate the buffers whose size depends on crowding; if that fails, keep the old ones."""
         places, planes = self.places, int(kernels.PLANES.value)
         for needed in (kernels.NEEDED_ROOM, kernels.NEEDED_SLOTS):
             self.status[int(needed.value)] = 0  # what a refused rollout needed says nothing about the next one
@@ -369,7 +369,7 @@ class ContactRun:
         return int(self.status[int(kernels.ROUNDS.value)])
 
     def fits(self) -> bool:
-        """True if lists were complete and buffers large enough since :meth:`take`; if not, they will. The host waits.
+        """True if lists were complete and buffers large enough since :meth:`take`; if not, enlarge them (host waits).
 
         Lists are made for the motion of the substeps before, and a bit more.
         """
@@ -391,7 +391,7 @@ class ContactRun:
         return range(0, steps if self.stage.contact is not None and self.places else 0, self.interval)
 
     def make_lists(self, _: int = 1) -> None:
-        """List the samples that may touch before a node moves by half the margin; can be recorded."""
+        """List candidate pairs, valid until a node moves by half the margin; recordable."""
         stage, places, block = self.stage, self.places, lanes(self.device, BLOCK, 1)
         self._read()
         self.low.copy_(self.position.amin(0))

@@ -175,7 +175,7 @@ COLUMNS = tl.constexpr(1024)
 
 @triton.jit
 def cell_of(x, low, inverse):
-    """Cells of places along an axis, from 1 on; where there is no number, the last one."""
+    """Cell numbers of places along an axis, from 1 on; NaN goes to the last one."""
     t = (x - low) * inverse
     return tl.where(t < COLUMNS - 3, t, COLUMNS - 3).to(tl.int32) + 1
 
@@ -196,7 +196,7 @@ def hashed(cx, cy, last):
 def contact_cells(
     fields, active, active_nodes, before, position, low, limit, cells, hashes, places, last, BLOCK: tl.constexpr
 ):
-    """Write the places of samples with their columns, what they are sorted by, and where the nodes are now."""
+    """Write places with their hashed columns, sort keys, and the current node positions."""
     p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = p < active_nodes
     at = fields + tl.load(active + p, mask, 0) * 8

@@ -29,7 +29,7 @@ from gaussian_swaying.kernels.graphs import recorded_key, tensors_in
 
 @dataclass(frozen=True)
 class Numbers:
-    """The number of numbers, and a function that returns them as a tensor or a sequence."""
+    """Parameter count and getter; the getter returns a tensor or a sequence."""
 
     count: int
     take: Callable[..., Any]
@@ -102,7 +102,7 @@ class Composed(Constant):
 
     Attributes:
         options: The options of each, and its parts.
-        per_point: First and number of the numbers of a point, for each device function; the others likewise.
+        per_point: (offset, count) of the per-point numbers of each device function; the others likewise.
         numbers: Those of all points.
         per_substep: Those of a substep.
         tables: Where the table of each starts: that of its parts (``size`` entries), and then its own.
@@ -137,7 +137,7 @@ def _places(counts: Any) -> tuple[tuple[int, int], ...]:
 
 
 def end_of(places: Sequence[tuple[int, int]]) -> int:
-    """The end of the last of some groups of numbers."""
+    """Total count of groups of numbers."""
     return sum(places[-1]) if places else 0
 
 
@@ -175,7 +175,7 @@ class Packed:
         self._seen: dict[int, tuple[object, object]] = {}
 
     def take(self, given: Sequence[DeviceFunction], steps: int) -> Tensor | None:
-        """Bring the buffers up to date; what one device function has is written only if its sources have changed.
+        """Bring the buffers up to date, rewriting only what changed since the last call.
 
         Returns:
             The numbers of the points, shape (N, n); None if all is as it was. It never is for tensors of inference

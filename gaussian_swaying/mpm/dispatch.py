@@ -164,7 +164,7 @@ def _once(functions: Any) -> tuple[Any, ...]:
 
 
 def in_common(laws: Sequence[ConstitutiveLaw], name: str) -> Any:
-    """``(F, mu, lam)``: the ``wave`` or ``energy`` density that all laws share.
+    """The ``wave`` or ``energy`` density ``(F, mu, lam)`` shared by all laws.
 
     None if they do not, or if it needs numbers of a law or an internal variable.
     """

@@ -149,7 +149,7 @@ class Structure:
         return K.tocsr()
 
     def reduced(self, K: Any) -> tuple[Any, Any]:
-        """Stiffness and mass of the degrees of freedom, by a stiffness of the nodes."""
+        """Stiffness and mass in the degrees of freedom, from a nodal stiffness."""
         import scipy.sparse as sparse
 
         S = self.spread
@@ -425,7 +425,7 @@ def _power_of_two(value: float) -> float:
 
 
 def rayleigh(K: Any, M: Any, shapes: np.ndarray) -> float:
-    """Rayleigh's quotient of the leans along x and y (n, 2): the lower one."""
+    """The smaller Rayleigh quotient of leans along x and y, (n, 2)."""
     return float(((shapes * (K @ shapes)).sum(0) / (shapes * (M @ shapes)).sum(0)).min())
 
 

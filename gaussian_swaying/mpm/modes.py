@@ -165,7 +165,7 @@ class Modes(Total):
 
     @property
     def inertia(self) -> Tensor:
-        """Generalised masses of the modes, which are one, shape (..., M); with the gradient of the masses."""
+        """Modal masses, all one, shape (..., M); they carry the gradient of the masses."""
         mass = self.points.mass
         one = torch.ones_like(self._square)
         if not torch.is_grad_enabled() or not mass.requires_grad:
@@ -240,7 +240,7 @@ class Modes(Total):
     # ---- steps
 
     def first_state(self, velocity: Tensor, margin: int) -> MPMState:
-        """The state at time zero; of a first velocity remains what the modes can show."""
+        """The state at time zero, with the initial velocity projected on the modes."""
         state = super().first_state(velocity, margin)
         p = self._project(self.node_mass[..., None] * state.nodal[1])
         return self.shown(state, torch.zeros_like(p), p)
@@ -337,7 +337,7 @@ class Modes(Total):
 
     @torch.no_grad()
     def leaning(self, force: Force, rounds: int = 40) -> MPMState:
-        """The state in which a steady force is in balance with the stiffness, by damped iteration."""
+        """The equilibrium under a steady force, by damped iteration."""
         state = self.first_state(torch.zeros_like(self.points.position), 0)
         q, p = self.amplitudes(state)
         group, square = self._grouped(force), self.square.to(q)
@@ -444,7 +444,7 @@ def _holds_still(boundary: Boundary) -> bool:
 
 
 def warped(turn: Tensor, shift: Tensor) -> Tensor:
-    r"""A displacement that is turned along its way: :math:`\int_0^1 R(s w)\, ds\; d` (Choi & Ko 2005, equation 13).
+    r"""A displacement rotated progressively: :math:`\int_0^1 R(s w)\, ds\; d` (Choi & Ko 2005, equation 13).
 
     Args:
         turn: Rotation w of a place, axis times angle [rad], shape (..., 3).

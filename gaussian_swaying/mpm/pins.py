@@ -701,7 +701,7 @@ def middle_plane(part: _Part, dx: float) -> tuple[Tensor, Tensor]:
 
 
 def cells_of_places(place: Tensor, grid: GridSpec, massive: Tensor) -> Tensor:
-    """The cell whose nodes all have mass, in or next to each place; the weights of another one would not add up to one.
+    """A cell in or next to each place whose 27 nodes all have mass, so that its weights add up to one.
 
     Args:
         place: Places at rest [m], shape (N, 3).
@@ -913,7 +913,7 @@ class PinnedRows:
 
     @_one_thread()
     def in_kernels(self, dtype: torch.dtype) -> InKernels:
-        """The same for the kernels, if the same points are at rest all the time."""
+        """The rows as the kernels need them; None unless the same points are pinned at rest throughout."""
         node, weight, C, W = (field[0] for field in (self.rows.node, self.rows.weight, self.C, self.W))
         inverse = W.mT @ W
         real = self.real

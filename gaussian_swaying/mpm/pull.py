@@ -44,5 +44,5 @@ def pull(per_point: Callable[[], torch.Tensor], place: Callable[..., torch.Tenso
 
 
 def still_pull(points: torch.Size) -> DeviceFunction:
-    """A pull that holds nothing yet; ``points`` is the shape of a field of one number for each point."""
+    """A pull that holds nothing yet; ``points`` is the shape (..., P)."""
     return pull(lambda: torch.zeros(*points, 4), lambda time, dt, steps: torch.zeros(steps, 3))

@@ -186,14 +186,14 @@ class Run(ABC):
             return state, self.speed[0] / self.settings.dx
 
     def begin(self, steps: int, loaded: bool) -> None:
-        """Fill what some substeps read besides the state and the schedule."""
+        """Upload what substeps read besides the state and the schedule."""
         self.first_step.zero_()
         self.loads.begin(self.time, self.dt, steps)
         if loaded:
             self.load.zero_()
 
     def options_for(self, device_functions: Sequence[DeviceFunction]) -> dict[str, Any]:
-        """Constants of the kernels of a substep with some forces alone, whose numbers are copied if they changed."""
+        """Compile options of the kernels for some forces; uploads changed parameters."""
         values = self.loads.take(device_functions, MAX_STEPS)
         check_indices(self.loads.layout.size)
         if values is not None:
@@ -208,7 +208,7 @@ class Run(ABC):
         }
 
     def table(self, kick: float, dt: float, steps: int) -> Tensor:
-        """The schedule on the host, which can be copied without making it wait."""
+        """The schedule in pinned memory, for a copy without waiting."""
         first, other = (math.exp(-self.settings.damping * time) for time in (kick, dt))
         real = self.like["dtype"]
         table = torch.empty(steps + 2, kernels.SCHEDULE, dtype=real, pin_memory=self.device.type == "cuda")
@@ -316,7 +316,7 @@ class Run(ABC):
 
 @contextmanager
 def at_home(buffer: Tensor) -> Iterator[None]:
-    """Within the block, launch Triton on the device of a buffer, and create tensors that can be written in any mode."""
+    """Within the block, launch Triton on a buffer's device, and create tensors outside inference mode."""
     with torch.cuda.device_of(buffer), torch.inference_mode(False), torch.no_grad():
         yield
 

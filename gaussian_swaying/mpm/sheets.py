@@ -85,7 +85,7 @@ def flattened(F, n, mu, lam):
 
 @triton.jit
 def without_normal(a, n):
-    """A matrix A (I - n n^T)."""
+    """The tangential part A (I - n n^T) of a matrix."""
     return axpy9(1.0, a, -1.0, outer3(matvec(a, n), n))
 
 
@@ -154,7 +154,7 @@ def stress_of_sheets(F: Tensor, normal: Tensor, mu: Tensor, lam: Tensor, pk1: Ca
 
 
 def director_energy(F: Tensor, normal: Tensor, mu: Tensor) -> Tensor:
-    """Energy density W of what F does across sheets [J/m³], shape (...); the arguments are those of a sheet's stress.
+    """Energy density of transverse shear and thickness change of sheets [J/m³], shape (...).
 
     It is :data:`DIRECTOR` times mu times half the square of the shear and a quarter of that of n C n - 1.
     """
@@ -188,7 +188,7 @@ class Bending:
 
     @torch.no_grad()
     def rows(self) -> Tensor:
-        """Rows v of each cell, as few as the rank of its matrix, the sum of v v^T; shape (K, rank of all, 27)."""
+        """A factorisation of each cell's matrix: rows v with sum v v^T; shape (K, rank of all, 27)."""
         parts = [torch.linalg.eigh(in_double(some)) for some in self.stiffness.split(_AT_ONCE)]
         values, vectors = (torch.cat(column) for column in zip(*parts, strict=True))
         least = 27 * torch.finfo(self.stiffness.dtype).eps * values[:, -1:]

@@ -277,12 +277,12 @@ class MPMSolver(Fixed, Solver):
         return ("modes", "it is held, and nothing touches or folds") if why is None else ("total", why.split(": ")[0])
 
     def choose(self, *, anew: bool) -> None:
-        """Let ``auto`` choose anew with the next material, or keep its choice, as while a simulation runs."""
+        """Let ``auto`` choose anew with the next material, or keep its choice."""
         self._decided = not anew
         self._no_modes = None if anew else self._no_modes
 
     def rule_out_modes(self, why: str) -> None:
-        """Let ``auto`` be ``total`` from the next :meth:`init_state` on."""
+        """Make ``auto`` take ``total`` instead of ``modes`` from the next :meth:`init_state` on."""
         self._no_modes = why
 
     def _why_not_kernels(self, bound: Formulation) -> str | None:

@@ -283,7 +283,7 @@ class MaterialPoints:
 
     @property
     def elastic(self) -> Tensor | None:
-        """The points whose law has no return map, bool, shape (..., P); None if all of them."""
+        """Mask of points without plastic flow, shape (..., P); None if that is all of them."""
         if not any(law.plastic for law in self.laws):
             return None
         each = torch.tensor([not law.plastic for law in self.laws], device=self.position.device)
@@ -380,7 +380,7 @@ class State:
         return self.replace(**own)
 
     def tensors(self) -> list[Tensor]:
-        """The fields that may require a gradient."""
+        """Fields that may require a gradient."""
         without = ("lost", "time", "work", "impulse", "air")
         return [v for k, v in self.fields().items() if isinstance(v, Tensor) and k not in without]
 

@@ -289,7 +289,7 @@ class Total(Formulation):
         return matrix - matrix @ n @ n.mT
 
     def in_shape(self, state: MPMState) -> MPMState:
-        """The state with nodes and particles of rigid parts exactly where these are, and sheets in plane stress.
+        """The state with rigid parts exactly in shape, and sheets in plane stress.
 
         Particles at the border of a part have a small share of nodes that are not of it.
         """
@@ -352,7 +352,7 @@ class Total(Formulation):
         return 0.5 * (self.node_mass * state.nodal[1].square().sum(-1)).sum(-1)
 
     def sheet_energy(self, state: MPMState) -> Tensor | float:
-        """Energy of bending, and of what F does across sheets, whose membrane is that of the law."""
+        """Energy of bending and of transverse shear of sheets [J]; the laws have the membrane's."""
         if self.bending is None:
             return 0.0
         displacement = state.nodal[0]
@@ -559,7 +559,7 @@ class TotalRun(Run):
             self.residual = torch.zeros(2, self.points.node.shape[1], 4, **self.like)  # now, and its sum
 
     def cut(self, sizes: Tensor, programs: int) -> None:
-        """Cut crowded cells into pieces: otherwise a body of few cells has too few programs to fill a GPU."""
+        """Split crowded cells into pieces, so that a body of few cells has enough programs to fill a GPU."""
         most = self.lanes * max(1, -(-self.count // (self.lanes * programs)))
         counts = -(-sizes // most)
         first = counts.cumsum(0) - counts

@@ -41,7 +41,7 @@ _SHAPED = {"flat": 9, "m": 3, "area": 0, "thickness": 0, "thinning": 0}
 
 
 class Adjoints(Constant):
-    """The adjoints of what a body and its force are computed by, derived when a gradient is first wanted.
+    """Adjoints of a body's laws and force, derived on first use.
 
     Args:
         laws: The laws.
@@ -299,7 +299,7 @@ def hold_adjoint(
     weight_bar, multipliers, all_rows, inverse_mass, history, active_count, first_step, step_offset, last,
     WEIGHTS: tl.constexpr, BLOCK: tl.constexpr, ROWS: tl.constexpr,
 ):  # fmt: skip
-    """Subtract the rows, with weights of shape (nodes, rows), times their multipliers from the gradient.
+    """Subtract the weighted rows times their multipliers from the gradient.
 
     WEIGHTS adds the gradient by the weights: less the forward multiplier times the gradient by the momentum, and less
     that of the gradient times the velocity after the substep.
@@ -700,7 +700,7 @@ class _Rollout(torch.autograd.Function):
 
 
 def segment(steps: int, checkpoint: int, nodes: int) -> int:
-    """Substeps of a segment: as asked for, else about the square root of all, or more if they fit in 128 MiB.
+    """Substeps of a segment: as requested, else about the square root of all, or more if they fit in 128 MiB.
 
     It is a multiple of what a graph repeats.
     """
