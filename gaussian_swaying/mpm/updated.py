@@ -575,7 +575,7 @@ def crowd_of(position: Tensor, dx: float) -> float:
 
 
 def sorted_for(crowd: float, crossing: float, count: int) -> int:
-    r"""Return the number of substeps after which to sort again.
+    r"""Number of substeps between sorts that costs the least time.
 
     As the order gets stale, particles in a row no longer share their cell, and more atomic sums meet: the time of a
     substep grows with their share. Together with the time of the sorts it is least after :math:`\sqrt{S / r}` substeps,

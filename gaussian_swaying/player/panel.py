@@ -38,7 +38,7 @@ LIGHT = "shader.init_args.light"
 
 
 def slider(name: str, value: float, label: str = "") -> dict[str, Any]:
-    """The control of a number of the model: a slider between its ends, or a field where these are far away."""
+    """A control for a number of the model: a slider, or a field where the range is wide."""
     known = number(name)
     low, high = ENDS.get(name, (known.low, known.high))
     log = known.scale == "log" and (low > 0 or (name not in ENDS and value > 0))
@@ -163,7 +163,7 @@ class Panel:
             self.session.change(self._own[name](value))
 
     def legends(self) -> dict[str, dict[str, Any]]:
-        """The colour scales of pictures: name, unit, largest value and colours from zero to it, by pass."""
+        """Colour scales of the passes: name, unit, largest value, and colours from zero to it."""
         stepper = self.session.simulation.stepper
         colours = (255 * colormap(torch.linspace(0, 1, 9, dtype=torch.float64))).round().int().tolist()
         scales = {

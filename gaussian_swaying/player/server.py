@@ -109,7 +109,7 @@ class Door:
 
 
 def drawable(snapshot: Snapshot) -> bool:
-    """True if a browser can draw a snapshot: the Gaussians follow nodes, in a light that it knows."""
+    """True if a browser can draw a snapshot itself: its Gaussians follow nodes, and it knows the light."""
     shader = snapshot.simulation.painter.shader
     with turn(snapshot.simulation):
         has_nodes = snapshot.simulation.scene.follow.nodes(snapshot.state) is not None
@@ -118,7 +118,7 @@ def drawable(snapshot: Snapshot) -> bool:
 
 @torch.inference_mode()
 def colour_message(simulation: Simulation, film: Film, roles: Tensor, known: Tensor) -> bytes | None:
-    """Other colours of the Gaussians whose role has changed; None if there are none.
+    """New colours of the Gaussians whose role has changed; None if there are none.
 
     Their places in the film (uint32), and red, green and blue of each (uint8).
 
@@ -140,7 +140,7 @@ def colour_message(simulation: Simulation, film: Film, roles: Tensor, known: Ten
 
 @torch.inference_mode()
 def state_message(snapshot: Snapshot, ended: bool) -> bytes:
-    """The displacement of the nodes of a state: 6 bytes each, and 16 more for one that moved far."""
+    """Nodal displacements of a state: 6 bytes per node, and 16 more for one that moved far."""
     simulation, scene = snapshot.simulation, snapshot.simulation.scene
     with turn(simulation):
         moved = scene.follow.nodal(snapshot.state)
@@ -154,7 +154,7 @@ def state_message(snapshot: Snapshot, ended: bool) -> bytes:
 
 
 def turn(simulation: Simulation) -> AbstractContextManager[None]:
-    """On a GPU the turn of the thread that reads it, as another may record a graph; a CPU does not have to wait."""
+    """The lock for reading a simulation on a GPU, where another thread may be recording a graph; no lock on a CPU."""
     return simulation.turn if simulation.device.type == "cuda" else nullcontext()
 
 
@@ -193,7 +193,7 @@ class Client:
         return rate if time.monotonic() - said < RECENT else 0.0
 
     def confirm(self, count: int, rate: float) -> None:
-        """It has taken in so many messages with bytes, and shows so many pictures a second."""
+        """Note that the browser has taken in ``count`` messages, and its picture rate."""
         self._taken, self._rate = int(count), (min(max(float(rate), 0.0), 1000.0), time.monotonic())
 
     async def say(self, told: Mapping[str, Any] | bytes) -> None:
@@ -263,7 +263,7 @@ class Server:
         return self
 
     def progress(self, share: float | None, what: str = "") -> None:
-        """Show how much of something is done, from 0 to 1; None if there is nothing to wait for."""
+        """Show a progress bar from 0 to 1; None removes it."""
         self._progress = None if share is None else {"share": share, "what": what}
 
     def tell(self, notice: str, seconds: float = 15.0) -> None:

@@ -295,7 +295,7 @@ class Recorder:
             self._submit(encoder.path, encode)
 
     def told(self) -> list[str]:
-        """A sentence for each folder of pictures in which some show nothing; of those written so far."""
+        """A sentence for each folder with blank pictures, of those written so far."""
         found = {place: sorted(index for other, index in self._blank if other == place) for place, _ in self._blank}
         return [
             f"{len(frames)} pictures in {place} show nothing, the first in frame {frames[0]}: check `near` and the "

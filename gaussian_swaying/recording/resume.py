@@ -10,7 +10,7 @@ from gaussian_swaying._inputs import check_archive
 
 
 def packed_frames(path: Path) -> set[int]:
-    """The frames whose arrays were joined into a file, such as ``trajectory.npz``, if there is one."""
+    """Frames already packed into a file such as ``trajectory.npz``."""
     if not path.exists():
         return set()
     with zipfile.ZipFile(check_archive(path, "the run")) as archive:

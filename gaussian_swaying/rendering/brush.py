@@ -33,7 +33,7 @@ class Seen:
 
 
 def seen(means: Tensor, covariances: Tensor, camera: Camera, picture: RenderOutput, slack: float = 0.0) -> Seen:
-    """Gaussians on a screen: their places, and which of them the drawn surface does not hide.
+    """Project Gaussians to the screen, and mark those that the drawn surface does not hide.
 
     A Gaussian is hidden if it lies behind the depth at the pixel of its centre, by more than a slack and two standard
     deviations of its own. These are taken along the line of sight, and across it times the slope of the depth, as the
@@ -82,7 +82,7 @@ def _slope(depth: Tensor) -> Tensor:
 
 
 def touched(view: Seen, path: Tensor, radius: float, through: bool = False) -> Tensor:
-    """The Gaussians whose centres a brush touches that follows a path, their indices, rising, int64, shape (M,).
+    """Indices of Gaussians whose centres a brush touches along a path, rising, int64, shape (M,).
 
     Args:
         path: Corners of the path [pixels], shape (S, 2); the brush goes straight from one to the next.

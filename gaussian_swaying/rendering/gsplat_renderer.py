@@ -85,7 +85,7 @@ _LOADING = threading.Lock()
 
 
 def loaded_before() -> bool:
-    """True if :func:`load_kernels` finds kernels that it has loaded before, so that it takes a moment."""
+    """True if :func:`load_kernels` will load cached kernels, which takes a moment."""
     folder = build_folder()
     try:
         return (folder / "gsplat_cuda.stamp").read_text(encoding="utf-8") == _stamp(folder / "gsplat_cuda.so")
@@ -94,7 +94,7 @@ def loaded_before() -> bool:
 
 
 def build_folder() -> Path:
-    """The folder in which torch compiles the kernels of gsplat; its own function for it takes long to import."""
+    """Build folder of gsplat's kernels; torch's own function for it is slow to import."""
     root = os.environ.get("TORCH_EXTENSIONS_DIR")
     if root is None:
         python = f"py{sys.version_info.major}{sys.version_info.minor}{getattr(sys, 'abiflags', '')}"

@@ -34,7 +34,7 @@ MOST_PAIRS = 1 << 28
 
 
 def runs(tensors: Iterable[Tensor]) -> bool:
-    """True if :func:`render` can draw from some tensors: float32 on a CPU, and none wants a gradient."""
+    """True if :func:`render` supports these tensors: float32 on a CPU, without gradients."""
     if INTERPRETED or not compiles("cpu"):
         return False
     return all(

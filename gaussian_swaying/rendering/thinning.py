@@ -27,7 +27,7 @@ def thinned(
     detail: float = DETAIL,
     eps2d: float = 0.3,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    r"""Some of the Gaussians, which look like all of them.
+    r"""A random subset of the Gaussians that looks like all of them.
 
     The projected size s of a Gaussian is the root of the Frobenius norm of its covariance, times focal length per
     depth; no standard deviation of its projection is larger, but for the perspective at the border. Of those with s

@@ -70,7 +70,7 @@ def join(parts: Sequence[Patches]) -> Patches:
 
 
 def baked(patches: Patches, ambient: float, two_sided: bool) -> Tensor:
-    """Colours (N, 3) under the light of :data:`LIGHT`: ``colour (ambient + (1 - ambient) max(0, n L))``."""
+    """Lit colours (N, 3): ``colour (ambient + (1 - ambient) max(0, n L))`` with :data:`LIGHT`."""
     light = torch.tensor(LIGHT, dtype=torch.float64)
     cosine = patches.normal @ (light / light.norm())
     lit = cosine.abs() if two_sided else cosine.clamp_min(0)
@@ -283,7 +283,7 @@ def copies(template: Patches, axes: Tensor, size: Tensor, origin: Tensor, tint: 
 
 
 def facing(direction: Tensor, up: Tensor) -> Tensor:
-    """Rotations (M, 3, 3) that take y to a direction (M, 3) and z as near to ``up`` (M, 3) as possible."""
+    """Rotations (M, 3, 3) that take y to a direction (M, 3), with z as close to ``up`` (M, 3) as possible."""
     y = torch.nn.functional.normalize(direction, dim=-1)
     x = torch.nn.functional.normalize(torch.linalg.cross(y, up), dim=-1)
     return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)

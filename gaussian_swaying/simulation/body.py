@@ -202,7 +202,7 @@ class Scene(Fixed):
 
     @property
     def area_kind(self) -> str:
-        """``area``, or what null stands for."""
+        """``area``, or the default for this scene."""
         if self.area is not None:
             return self.area
         return "open" if self.ply is not None and self.wind_on == "surface" else "coverage"
@@ -215,7 +215,7 @@ class Scene(Fixed):
         return self.generator.generate()
 
     def select(self, cloud: GaussianCloud) -> Tensor:
-        """The Gaussians that are simulated: in the region, opaque enough, and in no part that is still or hidden.
+        """Mask of the simulated Gaussians: in the region, opaque enough, and in no still or hidden part.
 
         Args:
             cloud: All Gaussians.
@@ -459,7 +459,7 @@ def check_extent(means: Tensor, metres_per_unit: float, dx: float, index: Tensor
 
 
 def coarse(side: float, dx: float) -> list[str]:
-    """A sentence about the grid of a run if the object has so few cells that a finer grid would move it otherwise.
+    """A warning, as a list, if the object has so few cells that a finer grid would change its motion; else empty.
 
     Args:
         side: Longest side of the object [m].
@@ -471,7 +471,7 @@ def coarse(side: float, dx: float) -> list[str]:
 
 
 def narrow(points: Tensor, dx: float, moved: float) -> list[str]:
-    """A sentence about a tube that is bent and has few cells across, so that the grid decides whether it flattens.
+    """A warning, as a list, if a bent tube has so few cells across that the grid decides whether it flattens.
 
     Args:
         points: Rest positions of the points of a body that is not filled [m], shape (P, 3).
@@ -548,7 +548,7 @@ _BRIDGES = 8  # neighbours to which an extra point on a large Gaussian is attach
 def attached_samples(
     position: Tensor, normal: Tensor, count: int, parts: Parts | None, labels: Tensor | None
 ) -> Tensor:
-    """The pairs of samples of a surface that are attached.
+    """Pairs of attached samples of a surface.
 
     Args:
         position: Rest positions [m], those of the Gaussians first, then extra points, shape (N, 3).
@@ -569,7 +569,7 @@ def attached_samples(
 
 
 def pieces_in_cells(position: Tensor, dx: float, pairs: Tensor) -> Tensor:
-    """A number for each sample, the same for those in one cell that are attached within it.
+    """Labels of samples: equal for those attached to each other within one cell.
 
     Args:
         position: Rest positions [m] in the precision of the solver, shape (N, 3).
@@ -582,7 +582,7 @@ def pieces_in_cells(position: Tensor, dx: float, pairs: Tensor) -> Tensor:
 
 @torch.no_grad()
 def lies_apart(position: Tensor, dx: float, pairs: Tensor) -> bool:
-    """True if some node of the grid reaches samples that are not attached to each other there.
+    """True if a grid node reaches samples that are not attached to each other.
 
     Args:
         position: Rest positions [m] in the precision of the solver, shape (N, 3).
@@ -595,7 +595,7 @@ def lies_apart(position: Tensor, dx: float, pairs: Tensor) -> bool:
 
 @torch.no_grad()
 def homes(position: Tensor, dx: float, pairs: Tensor, piece: Tensor) -> tuple[Tensor, Tensor]:
-    """The places at which samples are grouped: a few of a piece beyond the border of a cell, at the next across it.
+    """Places by which samples are grouped; a few that stick out of a cell move to the next across its border.
 
     They would have copies of nodes of their own, with hardly any mass.
 
@@ -622,7 +622,7 @@ def homes(position: Tensor, dx: float, pairs: Tensor, piece: Tensor) -> tuple[Te
 
 
 def attached_points(pairs: Tensor, owner: Tensor, parent: Tensor | None, layers: int) -> Tensor:
-    """The pairs of material points that are attached.
+    """Pairs of attached material points.
 
     Args:
         pairs: Pairs of samples, shape (E, 2).
@@ -701,7 +701,7 @@ def joints_of(
 
 
 def with_parts(scene: Scene, cloud: GaussianCloud, material: Material, solver: Solver) -> tuple[Material, Solver]:
-    """Material and solver with what the parts of a scene add to them; both stay as they are if it has none.
+    """Material and solver, extended by the parts of a scene, if it has any.
 
     Args:
         material: Its ``regions`` come after those of the parts, and win.
@@ -924,7 +924,7 @@ def grouped(
     piece: Tensor | None = None,
     home: Tensor | None = None,
 ) -> tuple[Samples, Tensor, Tensor]:
-    """Samples for a grid: for each group one or a few that keep its mass, centre of mass and volume.
+    """Group samples for a grid: a few points per group, with its mass, centre of mass and volume.
 
     A group never mixes materials, laws, the surface and the inside, samples that feel wind and samples that do not,
     pieces, or the two sides of the border of a region in ``apart``.
@@ -973,7 +973,7 @@ def grouped(
 
 @torch.no_grad()
 def shared_wind(samples: Samples, owner: Tensor, parent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The patches that feel the wind, so that the points of a group share its wind as they share its mass.
+    """Distribute the patches of each group over its points, so that wind is shared as mass is.
 
     A group of up to :data:`SHARED` directions is one patch of each direction at each of its points, with an equal part
     of the area: the wind then has the second moments of the group, too. If each patch went to the point next to it,
@@ -1091,7 +1091,7 @@ FACING = 0.8
 
 @torch.no_grad()
 def surface_of(samples: Samples, owner: Tensor, points: MaterialPoints, dx: float, contact: Contact | None) -> Surface:
-    """The surface of an object: one of its samples for each part of a cell, with a disc for those that it stands for.
+    """Contact surface of an object: one sample per part of a cell, with a disc that covers those it stands for.
 
     Args:
         owner: A material point close to each, shape (N,).
@@ -1126,7 +1126,7 @@ def surface_of(samples: Samples, owner: Tensor, points: MaterialPoints, dx: floa
 
 @torch.no_grad()
 def close_at_rest(surface: Surface) -> int:
-    """Count pairs of contact samples closer at rest than the thickness, one above the other: they are pushed apart."""
+    """Number of contact pairs closer at rest than the thickness; these are pushed apart."""
     from scipy.spatial import cKDTree
 
     tree = cKDTree(surface.place.double().cpu().numpy())
@@ -1156,7 +1156,7 @@ def warn_close(surface: Surface) -> None:
 def still_distance(
     means: Tensor, covariances: Tensor, opacities: Tensor, low: Tensor, high: Tensor, cells: int, level: float
 ) -> DistanceGrid:
-    """Signed distance from the surface of Gaussians that stand still: where their density passes a level.
+    """Signed distance to the surface of static Gaussians, where their density passes a level.
 
     Args:
         means: Centres [m], shape (N, 3).
@@ -1316,7 +1316,7 @@ def _require_cells_as_large_as(span: Tensor, thickness: Tensor, dx: float) -> No
 def specks_of(
     cloud: GaussianCloud, simulated: Tensor, scene: Scene, frame: SimFrame, dx: float, by_grid: bool
 ) -> Tensor:
-    """The simulated Gaussians that are not connected to the object, if ``scene.loose`` carries them.
+    """Indices of simulated Gaussians not connected to the object, if ``scene.loose`` carries them.
 
     Args:
         simulated: Indices of those that are simulated, shape (N,).
@@ -1595,7 +1595,7 @@ class SimulatedScene(nn.Module):
 
     @torch.no_grad()
     def still_distance(self, low: Tensor, high: Tensor, cells: int, level: float = 0.5) -> DistanceGrid:
-        """Signed distance from the surface of the Gaussians that stand still, in a box.
+        """Signed distance to the surface of the static Gaussians in a box.
 
         Args:
             low: Lower corner of the box [m], shape (3,).
@@ -1648,7 +1648,7 @@ class SimulatedScene(nn.Module):
         return replace(rest, **parts)
 
     def moved(self, state: State, rotations: bool = True) -> dict[str, Any]:
-        """The Gaussians that move, in the order of ``moving``: the fields that :meth:`deformed` changes, by name."""
+        """Fields of the moving Gaussians that :meth:`deformed` changes, by name, in the order of ``moving``."""
         rest, index = self.rest(), self.moving
         own = rest.means, rest.covariances, rest.normals
         if not self.all_move:
@@ -1685,7 +1685,7 @@ class SimulatedScene(nn.Module):
         return self._kept[1]
 
     def on_gaussians(self, values: Tensor) -> Tensor:
-        """Values of the moving Gaussians (M,) for all of them (N,); the static ones get 0."""
+        """Spread values of the moving Gaussians (M,) to all (N,); static ones get 0."""
         own = values.to(self.model.means.dtype)
         return own.new_zeros(len(self.model.means)).index_copy(0, self.moving, own)
 

@@ -35,7 +35,7 @@ def splat_checksum(scene: SimulatedScene) -> str | None:
 
 
 def parts_checksum(scene: SimulatedScene) -> str | None:
-    """Checksum of the parts of a scene, as their file may have been painted over."""
+    """Checksum of the parts of a scene, as their file may change."""
     return None if scene.parts is None else scene.parts.digest()
 
 
@@ -126,7 +126,7 @@ NODAL = "node_displacement"
 
 
 class Closing:
-    """Makes the end of a recorded motion its beginning, see ``recorder.loop``.
+    """Makes a recorded motion loop, see ``recorder.loop``.
 
     Args:
         scene: The scene.
@@ -174,7 +174,7 @@ class Closing:
         return {"frames": self.frames if self.count else None, "count": self.count, "first": list(self._first)}
 
     def resume(self, kept: dict[str, Any]) -> None:
-        """Go on with what :meth:`kept` returned."""
+        """Restore what :meth:`kept` returned."""
         if (kept["frames"], kept["count"]) != (self.kept()["frames"], self.count):
             raise ValueError(
                 "A motion that closes has a length: resume with the `frames` and the `recorder.loop` of the run, or "

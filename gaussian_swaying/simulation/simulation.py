@@ -87,7 +87,7 @@ from gaussian_swaying.wind.force import AeroForce
 def load_ahead(device: torch.device) -> Callable[[], None]:
     """Begin to load what a device needs, in a thread: its context, Triton's compiler and gsplat's kernels.
 
-    What cannot be loaded is left to those who need it, who meet the error. Nothing is compiled that takes long.
+    Failures are ignored; the first use reports them. Nothing that takes long is compiled.
 
     Args:
         device: The device of a simulation; only a CUDA device needs anything.
@@ -396,7 +396,7 @@ class Simulation(Fixed):
 
     @in_turn
     def adopt(self, model: Model) -> None:
-        """Continue with another model of the same scene, as :meth:`change` does with single numbers."""
+        """Continue with another model of the same scene; :meth:`change` does this for single numbers."""
         before, editor = self.model, self._editor
         if model.points is not before.points and editor.edits:
             raise ValueError("`edits` give the material of parts of the object: change it there, not everywhere.")
@@ -434,7 +434,7 @@ class Simulation(Fixed):
         return other
 
     def batch(self, models: Sequence[Model]) -> Stepper:
-        """Several models of this scene as one, such as ``[model, model.at("wind.speed", 9)]``: in one rollout.
+        """Combine models of this scene, such as ``[model, model.at("wind.speed", 9)]``, to one rollout.
 
         Args:
             models: They may differ in wind and material.
@@ -672,7 +672,7 @@ def run_batch(
 
 
 class RecordedRun:
-    """The motion in the folder of a run, and the simulation of its configuration and splat.
+    """A recorded run: its motion, and a simulation rebuilt from its configuration and splat.
 
     Args:
         folder: The output folder of ``gaussian-swaying sim``.

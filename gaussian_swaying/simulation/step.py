@@ -50,7 +50,7 @@ from gaussian_swaying.wind.tables import Shelter
 
 
 class Copies(nn.Module):
-    """The copies of an object: its ``x`` lies at ``A x + b`` in each copy, and each feels the wind there.
+    """Copies of an object: a point ``x`` lies at ``A x + b`` in each copy, which feels the wind there.
 
     Args:
         copies: The copies.
@@ -93,7 +93,7 @@ class Copies(nn.Module):
         return len(self.copies)
 
     def winds(self, wind: Wind) -> Wind | Sequence[Wind]:
-        """The wind of the object with the gusts of each copy."""
+        """The wind, with the gusts of each copy."""
         if not isinstance(wind, WindField):
             return [wind] * len(self)
         own = int(wind.seed)
@@ -103,11 +103,11 @@ class Copies(nn.Module):
         ])  # fmt: skip
 
     def place(self, copy: int, points: Tensor) -> Tensor:
-        """Points (..., 3) of the object as they lie in a copy [scene units]; computed in float64, for far copies."""
+        """Points (..., 3) of the object transformed to a copy [scene units], in float64."""
         return (in_double(points) @ self.rotation[copy].mT + self.offset[copy]).to(points)
 
     def in_object(self, point: Tensor) -> Tensor:
-        """The points of the object that lie at a point (3,) of the scene in each copy [scene units], shape (B, 3)."""
+        """Points of the object that coincide with a scene point (3,) in each copy [scene units], shape (B, 3)."""
         found: Tensor = ((point.to(self.offset) - self.offset)[:, None] @ self.rotation)[:, 0]
         return found
 
@@ -254,7 +254,7 @@ class Stepper:
 
     @property
     def materials(self) -> tuple[MaterialPoints, ...]:
-        """The material of each scene as the solver gets it: that of its model, with the air that it carries."""
+        """Material of each scene for the solver, with the mass of carried air."""
         known, self._materials, found = self._materials, {}, []
         for model in self.models:
             points, patches, aero = model.points, model.scene.patches, model.aero
@@ -272,7 +272,7 @@ class Stepper:
 
     @property
     def joints(self) -> list[Force]:
-        """The force of the joints between parts, if there are any; made again for another material."""
+        """Force of the joints between parts, or None; rebuilt when the material changes."""
         joints = self.scene.joints
         if not joints:
             return []
@@ -323,7 +323,7 @@ class Stepper:
         return self.wind_force.air(state.time, place)
 
     def flows(self) -> Tensor:
-        """Flows of the wind without gusts [m/s], shape (K, 3); those of a spatial wind are at the particles."""
+        """Mean flows of the wind [m/s], shape (K, 3); of a spatial wind, at the particles."""
         winds = [model.wind for model in (self.models if self.copies is None else [self.model])]
         flows = [wind.flows for wind in winds if isinstance(wind, WindField)]
         if len(flows) == len(winds):
@@ -347,7 +347,7 @@ class Stepper:
         return scene.on_gaussians(torch.where(scene.in_wind, torch.linalg.vector_norm(force, dim=-1), 0.0))
 
     def force_scale(self) -> float:
-        """Force per area [Pa] that the wind's flow, without gusts, can exert on a patch at rest; 1 in still air."""
+        """Largest force per area [Pa] of the wind without gusts on a patch at rest; 1 in still air."""
         aero = self.model.aero
         speed = float(torch.linalg.vector_norm(self.flows().detach(), dim=-1).amax())
         coefficients = float(torch.stack([aero.C_D, aero.C_F, aero.C_L]).detach().abs().sum())
@@ -398,7 +398,7 @@ class Stepper:
             return state.replace(air=self._air.start(state.time))
 
     def rehearse(self) -> None:
-        """Raise the errors that a start with the present model would raise."""
+        """Raise the errors that starting with the present model would raise."""
         rehearsed = self.bind()
         self.solver.prepare()
         self.solver.substeps(rehearsed, self.frame_dt)
@@ -501,7 +501,7 @@ class Stepper:
 
     @in_turn
     def launch(self, state: State, steps: int | None = None) -> Launched:
-        """Pass a frame to the device; ``launch(state).finish()`` is :meth:`advance`, and the host can work between.
+        """Start computing a frame; ``launch(state).finish()`` is :meth:`advance`, and the host may work between.
 
         Args:
             steps: Number of substeps, as several batches that are compared take; those that it needs if None.
@@ -533,7 +533,7 @@ class Stepper:
         return self._gauge(self.solver, end, steps, courant, state, needs, same, self.lift)
 
     def at_first(self, state: State) -> Measurement:
-        """Start measuring a state, such as the first, without a frame that led to it."""
+        """Start measuring a state that no frame led to, such as the first."""
         return measure(self.solver, state, 0, 0.0, lift=self.lift)
 
     def give_up(self, state: State, cause: str, remedy: str | None = None) -> NoReturn:
@@ -545,7 +545,7 @@ class Stepper:
 
     @property
     def foresees(self) -> bool:
-        """True if the needs of the next frame are measured at the end of a frame, so that the host waits once."""
+        """True if the next frame's needs are measured with this frame, so that the host waits once."""
         simple = self.solver.substep is None and self.solver.stiffness_damping == 0
         return simple and self.solver.has_kernels and self.wind_force.recordable
 
@@ -604,7 +604,7 @@ class Stepper:
 
 
 def stepper_of(model: Model) -> Stepper:
-    """What advances a model and those that were made from it: what they have in common is computed once."""
+    """The stepper shared by a model and all models made from it."""
     if "stepper" not in model.shared:
         model.shared["stepper"] = Stepper(model.method.like(model.solver), model)
     stepper: Stepper = model.shared["stepper"]
@@ -623,7 +623,7 @@ def start(model: Model) -> State:
 
 
 def step(model: Model, state: State) -> State:
-    """A frame later: in as many substeps as are stable, done again with shorter ones where these were too long.
+    """Advance by one frame, with as many substeps as are stable.
 
     A function of its arguments, through which gradients reach numbers of the model and the state. Models that differ in
     numbers share what does not depend on them, so ``model.at("wind.speed", 9)`` may be another one in every frame.
@@ -731,7 +731,7 @@ class Outlook:
         self._read = [weakref.ref(tensor) for tensor in _read(state)]
 
     def holds(self, state: State, parts: tuple[object, ...] | None) -> bool:
-        """True if the frame starts from this state and nothing changed since; ``parts`` is the result of now."""
+        """True if the next frame starts from this state and ``parts`` is unchanged."""
         same = all(known() is tensor for known, tensor in zip(self._read, _read(state), strict=False))
         return same and self._parts is not None and self._parts == parts
 
@@ -742,7 +742,7 @@ def _read(state: State) -> list[Tensor]:
 
 
 def parts_of(stepper: Stepper) -> tuple[object, ...] | None:
-    """Return the key of all that the needs depend on besides the state; None if changes cannot be detected.
+    """Key of all that the needs of a frame depend on besides the state; None if changes cannot be detected.
 
     That is so for tensors of inference mode, and for tensors on another device than the simulation.
     """
@@ -844,7 +844,7 @@ class SceneEditor:
         return self.stepper.start()
 
     def edit(self, state: State, edits: Sequence[Edit]) -> State:
-        """Apply edits now, whatever their time; if one is not possible, nothing changes."""
+        """Apply edits now, whatever their time; all or nothing."""
         before = self.stepper.model, self.unedited, self.version
         try:
             return self._go_on(state, edits)
@@ -880,7 +880,7 @@ class SceneEditor:
         return sorted({edit.time for edit in self.edits})
 
     def reach(self, edit: Edit) -> tuple[Tensor, Tensor]:
-        """Return masks of the particles (P,) and of the Gaussians (N,) that an edit changes."""
+        """Masks of the particles (P,) and Gaussians (N,) that an edit changes."""
         scene, region, means = self.scene, edit.region, self.scene.model.means.detach()
         given = (scene.points.youngs_modulus, scene.points.poisson_ratio, scene.points.mass)
         if edit.of_material and any(value.requires_grad for value in given):

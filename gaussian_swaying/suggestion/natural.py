@@ -46,7 +46,7 @@ TIP, LITTLE, MOST_CHANGE = 0.7, 0.02, 2.5
 
 @dataclass(frozen=True)
 class Natural:
-    """Numbers of a thing that sways as its kind does.
+    """Stiffness, mass and drag of a thing that sways as its kind does.
 
     Attributes:
         height: Height [m], or length from the pivot to the centre of mass of a hanging thing, that decides its
@@ -75,7 +75,7 @@ class Natural:
 
 
 def natural(simulation: Simulation, kind: Kind, flow: Tensor, intensity: float) -> Natural:
-    """Find the numbers of a kind for a scene, and give them to the simulation.
+    """Find stiffness, mass and drag for a kind, and apply them to the simulation.
 
     Args:
         flow: Mean wind [m/s], z up, shape (3,).

@@ -34,12 +34,12 @@ Motion = tuple[Array, Callable[[Array, int], Array]]
 
 
 def rate_for(frequency: float) -> float:
-    """Samples in a second of the record of a thing with a first frequency [Hz]."""
+    """Sampling rate [1/s] of the record for a first frequency [Hz]."""
     return min(max(PER_PERIOD * frequency, LEAST_RATE), RATE)
 
 
 class Response(NamedTuple):
-    """Slow complex vibrations of a tip, and what of a load on the modes each takes.
+    """Slow vibrations of a tip under loads on modes.
 
     Attributes:
         root: Their complex frequencies [1/s], shape (K,).
@@ -106,7 +106,7 @@ def linear_motion(bound: Modes, force: WindForce, wind: WindField, top: torch.Te
 
 
 def cloth_motion(wind: WindField, places: torch.Tensor, frequency: float, ratio: float) -> Motion:
-    """Motion of one oscillator along each axis in the mean wind of some places, as that of a hanging cloth.
+    """Motion of a hanging cloth as one oscillator per axis, in the mean wind of some places.
 
     Args:
         places: Places [m], shape (K, 3).

@@ -254,7 +254,7 @@ def suggest(
 
 
 def tuned(s: Suggestion, device: str) -> Suggestion:
-    """The suggestion with the numbers of its kind, a typical stretch of its wind, and its simulation."""
+    """The suggestion with stiffness, mass and drag of its kind, a typical stretch of wind, and its simulation."""
     kind, begin = KINDS[s.kind], Stopwatch()
     leafy = s.kind in ("plant", "succulent")  # whose leaves are seen one by one
     simulation = replace(s, connected="surface" if leafy else "grid").to_simulation(device)
@@ -287,7 +287,7 @@ def tuned(s: Suggestion, device: str) -> Suggestion:
 
 
 def why_apart(scene: SimulatedScene, dx: float, held: Tensor) -> str | None:
-    """The reason for nodes of their own, in words; None if parts should share them.
+    """The reason for separate nodes per part (``connected: surface``), in words; None if parts should share nodes.
 
     They should not share them if much lies beside what it is not attached to, and all hangs together with what is held:
     what does not would fall, though a grid may hold it.

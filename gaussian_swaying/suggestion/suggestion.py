@@ -134,12 +134,12 @@ class Suggestion:
 
     @property
     def sways(self) -> bool:
-        """True if its numbers are those of its kind: it is held, no cloth, and no material was given."""
+        """True if its numbers are its kind's: it is held, is no cloth, and no material was given."""
         return self.fixed and not self.real and not KINDS[self.kind].cloth
 
     @property
     def by_modes(self) -> bool:
-        """True if modes will do: it leans by less than :data:`MOST_LEAN`, or turns as one, which modes do exactly."""
+        """True if modes suffice: it leans by less than :data:`MOST_LEAN`, or turns rigidly, which is exact."""
         little = self.natural is None or self.natural.lean < MOST_LEAN or self.kind == "hanging"
         return self.sways and little
 
@@ -243,7 +243,7 @@ def hold_word(s: Suggestion) -> str:
 
 
 def things_lines(s: Suggestion) -> list[str]:
-    """The parts of a capture of a place, and how other things are chosen."""
+    """Lines on the parts of a capture of a place, and how to choose other things."""
     if s.place is None:
         return []
     lines = [
@@ -274,7 +274,7 @@ def cost_lines(cost: Cost) -> list[str]:
 
 
 def run_lines(simulation: Simulation) -> list[str]:
-    """What a configuration simulates, holds and blows."""
+    """Lines on what a configuration simulates, where it is held, and its wind."""
     scene, roles = simulation.scene, classify(simulation)
     regions = [repr(b.region) for b in conditions(simulation) if hasattr(b, "region")]
     mass, area = float(scene.points.mass.sum()), float(scene.patches.area.sum())
@@ -295,7 +295,7 @@ def run_lines(simulation: Simulation) -> list[str]:
 
 
 def as_plain(value: Any) -> Any:
-    """What JSON keeps of a part of a suggestion: of a mask the number of its Gaussians, and of others."""
+    """JSON form of a part of a suggestion; a mask becomes its number of Gaussians."""
     if isinstance(value, Region):
         return region_dict(value)
     if isinstance(value, np.ndarray):

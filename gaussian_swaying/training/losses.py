@@ -162,7 +162,7 @@ class LossTerm(nn.Module, ABC):
     needs: frozenset[str] = frozenset()
 
     def share(self, step: int) -> float:
-        """Return the factor on its weight at a step; 0 where it is not computed."""
+        """Factor on the weight at a step; 0 if the term is not computed then."""
         if step < self.start or (step - self.start) % self.every:
             return 0.0
         if self.stop is None:

@@ -84,7 +84,7 @@ def _sample(time, interval):
 
 @triton.jit
 def swayed(v, time, numbers, start):
-    """``SineSway``; as the others, of a velocity, the time, its numbers and the start of its stream."""
+    """``SineSway``; arguments as for all modulations: velocity, time, numbers, start of the random stream."""
     sway = 1 + numbers[0] * tl.sin(6.283185307179586 * time / numbers[1] + numbers[2])
     first = (tl.abs(v[0]) >= tl.abs(v[1])) & (tl.abs(v[0]) >= tl.abs(v[2]))
     second = tl.abs(v[1]) >= tl.abs(v[2])
@@ -409,7 +409,7 @@ class WindField(Fixed, nn.Module):
         return changed(self, effects=effects, _in_metres=True)
 
     def with_flow(self, flow: VectorLike) -> WindField:
-        """The same wind with another steady flow [m/s], in place of a schedule, too; a tensor keeps its gradient."""
+        """The wind with another steady flow [m/s] instead of its flow or schedule; a tensor keeps its gradient."""
         return changed(self, flows=flow_rows("flow", [flow]), times=self.times.new_zeros(1))
 
     def _keys(self, time: Tensor) -> tuple[Tensor, Tensor, Tensor]:

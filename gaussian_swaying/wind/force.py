@@ -58,7 +58,7 @@ LAWS = ("paper", "projected", "linear", "cross_flow")
 
 @triton.jit
 def drag_speed(air, relative, LAW: tl.constexpr):
-    """Speed that the drag is proportional to, besides that of the flow along a patch: that of the wind if linear."""
+    """The speed factor of drag, besides the flow along the patch: that of the wind in the linear law."""
     found = dot3(relative, relative)
     if LAW == 2:
         found = dot3(air, air)
@@ -142,7 +142,7 @@ def shaped_wind(position, now, table, EFFECTS: tl.constexpr):
 
 @triton.jit
 def add_direction(s, q, b, w, LAW: tl.constexpr):
-    """Add the area vector b to two sums.
+    """Add the area vector b of one direction to two sums.
 
     They are those of signed vectors, and (LAW 3) of b times the flow through it per
     area, times the size of that flow.
@@ -520,7 +520,7 @@ class AeroForce(Fixed, nn.Module):
 
 @triton.jit
 def air_push(F, velocity, position, point, numbers, now, table, OPTIONS: tl.constexpr):
-    """A force at rest less a rate times the velocity; ``point``: the force (3) and the rate."""
+    """Device function: a force at rest minus a rate times the velocity; ``point``: force (3) and rate."""
     return add3(point, -point[3], velocity), point[3] * 0.0
 
 
@@ -706,7 +706,7 @@ class WindForce(Force):
         return found if self.places is None else found @ self.places.turn.to(position)
 
     def samples(self, state: State, dt: float, steps: int) -> Tensor:
-        """Air velocity [m/s] at the particles of a state, at ``steps`` times, ``dt`` [s] apart, starting at its time.
+        """Air velocity [m/s] at a state's particles, at ``steps`` times, ``dt`` [s] apart, starting now.
 
         Returns:
             Shape (steps, ...), broadcastable to (steps, ..., P, 3) from its second axis on.

@@ -33,7 +33,7 @@ _COARSE = (0.5,)
 
 
 class Patches(nn.Module):
-    """Surface patches that feel the wind, and the material points that they belong to.
+    """Surface patches and the material points that carry them.
 
     Args:
         normal: Unit normals at rest, of either sign, shape (Q, 3).
@@ -111,7 +111,7 @@ class PatchSums(nn.Module):
         return len(self.vector) + 2 * len(self.tensor)
 
     def lists(self) -> Tensor:
-        """First row of each point in the :meth:`table`, and its number of vectors, shape (P, 2)."""
+        """First row and number of vectors of each point in the :meth:`table`, shape (P, 2)."""
         count = self.point.bincount(minlength=len(self.tensor))
         first = count.cumsum(0) - count + 2 * torch.arange(len(count), device=count.device)
         return torch.stack([first, count], -1).to(self.tensor)

@@ -59,7 +59,7 @@ class Film:
         facing: Unit normals of those that move in steps of 1/32767, and 32767 for Gaussians of a solid, int16, shape
             (L, 4).
         color: Red, green, blue and opacity in steps of 1/255, uint8, shape (N, 4).
-        growth: How much each grows while others are missing (:func:`growth`), in steps of 1/255, uint8, shape (N, 1).
+        growth: Inflation factor while streaming is incomplete (:func:`growth`), in steps of 1/255, uint8, shape (N, 1).
         order: The index of each in the splat, int64, shape (N,); the file does not have it.
         stencils: The nodes of each stencil, as rows of ``displacement``, uint32, shape (S, 27).
         displacement: Displacement of the nodes [m], float32, shape (K, M, 3).
@@ -126,7 +126,7 @@ def read_film(run: Path) -> Film:
 
 
 def film_without_frames(simulation: Simulation, state: Any, name: str) -> Film:
-    """The Gaussians of a simulation at rest and the nodes that move them; its state has a grid."""
+    """The Gaussians of a simulation at rest, with the nodes that move them."""
     nodes = simulation.scene.follow.nodes(state)
     assert nodes is not None  # the solver is `total` or `modes`
     return film_of(simulation, state.grid, nodes, torch.zeros(0, len(nodes), 3), name)
@@ -214,7 +214,7 @@ BLOCK = 16  # pixels
 
 
 def growth(scene: SimulatedScene, camera: Camera) -> Tensor:
-    """The growth of each Gaussian in a picture of a part of them, from 0 to 1, shape (N,).
+    """Inflation factor of each Gaussian in a partly loaded film, from 0 to 1, shape (N,).
 
     Of N Gaussians, n cover as much as all if each is s = sqrt(N / n) times as large. Where many lie one behind the
     other, as in haze or in a hedge, less is enough, and the picture is drawn much faster: each becomes max(1, s g)
@@ -248,7 +248,7 @@ _EVERY_THIRD_BIT = (
 
 
 def spread(position: Tensor, first: int = 1) -> Tensor:
-    """An order of places (N, 3) in which the first ones are spread over all of them, as indices (N,).
+    """An order (N,) of places (N, 3) whose first ones are spread over all of them.
 
     Places are sorted along a Z-order curve and taken in the order of van der Corput's sequence: the second lies in the
     middle, the third in the middle of the first half, and so on. Those of a part, of which the first one has a length,
@@ -281,7 +281,7 @@ def look_of(painter: Painter) -> dict[str, Any]:
 
 
 def stencils_of(stencil: Stencil, grid: GridSpec, nodes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The places at which the motion is read, and their stencils, for a browser.
+    """Places at which the motion is read, and their stencils, for a browser.
 
     Args:
         nodes: Flat indices of the nodes that are known, rising, shape (M,).

@@ -103,7 +103,7 @@ def pack_modes(
     """What a page needs to run ``modes``, as :func:`pack_total`; it fills the tables ``sites`` and ``nodes`` itself.
 
     Args:
-        wind_force: The wind on its sites; None if it does nothing.
+        wind_force: The wind on the sites; None without wind.
     """
     count, sites = bound.square.shape[-1], bound.sites
     functions = _functions([] if wind_force is None else [wind_force])
@@ -204,7 +204,7 @@ def _functions(forces: Sequence[Force]) -> list[DeviceFunction]:
 
 
 def blown(wind: WindField) -> tuple[Passes, dict[str, Tensor]]:
-    """The kernel of the wind at :data:`MOST_STEPS` times, and its tables: times, velocities, numbers of the gusts."""
+    """The kernel that samples the wind at :data:`MOST_STEPS` times, with its tables: times, velocities, gusts."""
     times = torch.zeros(MOST_STEPS, dtype=torch.float64)
     with noted() as blow:
         air = wind(times)

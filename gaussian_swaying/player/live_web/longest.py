@@ -14,7 +14,7 @@ MARGIN = 0.8
 
 
 def longest_courant(bound: Total) -> float:
-    """Courant number of :data:`MARGIN` times the largest stable substep of a scene at rest, without its pins.
+    """Courant number of :data:`MARGIN` times the largest stable substep at rest, without pins.
 
     Pins only lower frequencies.
     """

@@ -18,7 +18,7 @@ NEAR = 0.01
 
 
 def counted_pose(world_to_camera: Tensor, origin: Origin) -> Tensor:
-    """The same pose (4, 4), float64, for places that count from an origin."""
+    """The pose (4, 4), float64, after an origin is taken off the places."""
     moved = world_to_camera.clone()
     moved[:3, 3] += moved[:3, :3] @ torch.tensor(origin, dtype=moved.dtype)
     return moved
@@ -260,7 +260,7 @@ def project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 def azimuth_beside(flow: Sequence[float]) -> float | None:
-    """Azimuth [degrees] from which a flow [m/s, z up] goes to the right of the picture; None if it is not level."""
+    """Azimuth [degrees] from which a flow [m/s, z up] goes to the right; None if the flow is not level."""
     x, y, z = flow
     level = math.hypot(x, y)
     return math.degrees(math.atan2(-x, y)) if level > abs(z) else None
