@@ -218,11 +218,11 @@ def contact_lists(
     position, rest, base, corner, low, limit, start, order, ordered, candidates, near, many, impulse, status, places,
     room, apart, beside, last, VIRTUAL: tl.constexpr, BLOCK: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
-    """List the samples closer than ``limit`` to each that were at least ``apart`` from it at rest, and count them.
+    """For each sample, list those closer than ``limit`` now and farther than ``apart`` at rest.
 
     ``start`` is where the samples of a cell begin in their ``order``, in a table of hashed columns of cells: the three
-    cells of a column around a sample follow each other. Another column may have the same entry. With VIRTUAL also
-    those that were at least ``beside`` from it, and have another copy of a node that both reach. Nothing acts on them.
+    cells of a column around a sample follow each other. Another column may have the same entry. With VIRTUAL also those
+    that were at least ``beside`` from it, and have another copy of a node that both reach. Nothing acts on them.
     """
     wide = tl.arange(0, WIDE)[None, :]
     p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)

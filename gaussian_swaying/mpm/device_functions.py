@@ -178,8 +178,8 @@ class Packed:
         """Bring the buffers up to date, rewriting only what changed since the last call.
 
         Returns:
-            The numbers of the points, shape (N, n); None if all is as it was. It never is for tensors of inference
-            mode, whose changes cannot be detected.
+            The per-point numbers, shape (N, n); None if they have not changed. Changes of inference-mode tensors cannot
+                be detected, so these always count as changed.
         """
         layout, changed = self.layout if given is self.given else Composed(given), False
         if layout != self.layout:

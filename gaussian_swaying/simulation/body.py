@@ -597,7 +597,7 @@ def lies_apart(position: Tensor, dx: float, pairs: Tensor) -> bool:
 def homes(position: Tensor, dx: float, pairs: Tensor, piece: Tensor) -> tuple[Tensor, Tensor]:
     """Places by which samples are grouped; a few that stick out of a cell move to the next across its border.
 
-    They would have copies of nodes of their own, with hardly any mass.
+    Left in their own cell, they would get separate copies of nodes with hardly any mass.
 
     Args:
         position: Rest positions [m], shape (N, 3).

@@ -144,8 +144,7 @@ def shaped_wind(position, now, table, EFFECTS: tl.constexpr):
 def add_direction(s, q, b, w, LAW: tl.constexpr):
     """Add the area vector b of one direction to two sums.
 
-    They are those of signed vectors, and (LAW 3) of b times the flow through it per
-    area, times the size of that flow.
+    ``s`` gets sign(b w) b; in LAW 3, ``q`` gets sign(b w) (b w)² b / b².
     """
     along = dot3(b, w)
     sign = tl.where(along < 0, -1.0, 1.0)

@@ -18,7 +18,7 @@ NEAR = 0.01
 
 
 def counted_pose(world_to_camera: Tensor, origin: Origin) -> Tensor:
-    """The pose (4, 4), float64, after an origin is taken off the places."""
+    """The pose (4, 4), float64, relative to another origin."""
     moved = world_to_camera.clone()
     moved[:3, 3] += moved[:3, :3] @ torch.tensor(origin, dtype=moved.dtype)
     return moved
