@@ -100,7 +100,7 @@ def openness(
     lines = spread_lines(_LINES)
 
     def along(number: int, line: Tensor, first: Tensor, second: Tensor) -> tuple[Tensor, ...]:
-        """Patches, and what they get of a line: light, shares of the skin, gaps and weights."""
+        """Along one line: the patches, with their light, shares of the skin, gaps and weights."""
         turn = torch.stack([first, second, line], dim=-1)
         facing = normal @ turn
         cosine = facing[:, 2].abs()

@@ -111,7 +111,7 @@ def plane_velocity(velocity: Tensor, normal: Tensor, kind: str, friction: float)
 
 
 class Wall(Boundary):
-    """What particles cannot enter or leave: a half space, or a box that keeps them inside, by conditions on nodes.
+    """A half space that particles cannot enter, or a box that they cannot leave; it acts on grid nodes.
 
     Args:
         shape: A ``HalfSpace`` that they cannot enter, or a ``Box`` that they cannot leave, in scene units; a null in

@@ -172,7 +172,7 @@ def modal_swing(q, p, load, drag, factor, left, lost, count, BLOCK: tl.constexpr
 
 @triton.jit(do_not_specialize=("sites",))
 def modal_placed(moved, rest, out, sites, BLOCK: tl.constexpr):
-    """Places of sites, as :func:`modal_shown` shows nodes."""
+    """Positions of the sites: rest positions plus the displacement of :func:`modal_shown`."""
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = n < sites
     found = warp(load3(moved, 2, 6 * (sites + n), mask), load3(moved, 2, 6 * n, mask))

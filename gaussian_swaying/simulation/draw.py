@@ -302,8 +302,8 @@ def seen_from(sh: Tensor, eye: Tensor, means: Tensor, rotations: Tensor | None) 
 class CopiesPainter(Painter):
     """Draws the static Gaussians once and the object once for each copy, all from one splat.
 
-    Draws S static Gaussians plus, for each of B copies, M moving and H held ones. Only centres, shapes, normals and
-    colours exist for each copy; harmonics and opacities are those of the splat.
+    With S static Gaussians, B copies, and M moving and H held ones in each. Only centres, shapes, normals and colours
+    exist for each copy; harmonics and opacities are those of the splat.
 
     Args:
         stepper: Has copies.

@@ -55,7 +55,7 @@ class Natural:
         mass: Mass of what moves [kg].
         frontal: Area of its silhouette in the wind [m²].
         thicker: Factor on the thicknesses of the surface.
-        stiffer: Young's moduli [Pa], by those before.
+        stiffer: New Young's moduli [Pa], keyed by the old ones.
         drag: Factor on the drag, friction and lift coefficients.
         coefficient: Drag coefficient of the whole on its silhouette.
         lean: Mean displacement of the upper tenth in the mean wind, over the longest side.

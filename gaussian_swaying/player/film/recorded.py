@@ -287,9 +287,9 @@ def stencils_of(stencil: Stencil, grid: GridSpec, nodes: Tensor) -> tuple[Tensor
         nodes: Flat indices of the nodes that are known, rising, shape (M,).
 
     Returns:
-        The places in cells of the grid from its first node, float64, shape (N, 3); rounding of arms leaves each in the
-        cell of its stencil, where it is ``floor(place - 0.5)``. The number of the stencil of each, shape (N,), and the
-        rows of the 27 nodes of each stencil in ``nodes``, shape (S, 27).
+        The places in cells from the first node of the grid, float64, shape (N, 3), nudged so that rounding does not
+            move them out of the cell ``floor(place - 0.5)`` of their stencil; the stencil of each, shape (N,); and the
+            27 nodes of each stencil, as rows of ``nodes``, shape (S, 27).
     """
     number = torch.unique(stencil.cell, return_inverse=True)[1]
     count = int(number.max()) + 1 if len(number) else 0
