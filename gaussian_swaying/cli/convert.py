@@ -7,8 +7,9 @@ from pathlib import Path
 
 from gaussian_swaying import _program as program
 from gaussian_swaying._files import write_text
+from gaussian_swaying._inputs import read_json
 from gaussian_swaying.cli.errors import run_command
-from gaussian_swaying.interop.physgaussian import convert, read_config, to_yaml
+from gaussian_swaying.interop.physgaussian import convert, to_yaml
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -19,18 +20,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("config", type=Path, help="A configuration of PhysGaussian.")
     parser.add_argument("--output", type=Path, help="YAML file to write; by default it is printed.")
-    parser.add_argument("--cameras", help="cameras.json of the 3DGS model, for its lens and default_camera_index.")
-    parser.add_argument(
-        "--sticky-planes", action="store_true", help="Make every plane stick, as PhysGaussian's code does."
-    )
     return run_command(
         lambda: write(parser.parse_args(arguments)), stopped="Stopped; nothing was written.", memory="a smaller file"
     )
 
 
 def write(options: argparse.Namespace) -> None:
-    """Convert, write or print the YAML, and report its file and every setting whose meaning differs."""
-    settings, notes = convert(read_config(options.config), options.cameras, options.sticky_planes)
+    """Convert, write or print the YAML, and report its file and what is left out."""
+    settings, notes = convert(read_json(options.config, "PhysGaussian configuration"))
     text = to_yaml(settings, notes, options.config.name)
     if options.output is None:
         print(text, end="")

@@ -16,6 +16,7 @@ from gaussian_swaying._checks import check_positive
 from gaussian_swaying.cli.errors import run_command  # first, as it sets up threads
 from gaussian_swaying.gaussians.formats import (
     FORMATS,
+    Format,
     endings,
     export_cloud,
     export_frames,
@@ -23,68 +24,39 @@ from gaussian_swaying.gaussians.formats import (
     numbered,
     read_gaussians,
 )
-from gaussian_swaying.gaussians.spz import VERSIONS
+from gaussian_swaying.gaussians.spz import WRITTEN
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.player.film.page import write_film, write_player
 from gaussian_swaying.simulation.simulation import RecordedRun
+
+TAKEN = {"a film": "", "the frames of a run": "apart spz_version", "a splat": "up metres_per_unit spz_version"}
+"""The options of each kind of export; a format may have fewer."""
 
 
 def build_options() -> argparse.ArgumentParser:
     """The command line."""
     parser = argparse.ArgumentParser(prog=program.name("export"), description=__doc__)
-    parser.add_argument(
-        "source",
-        help=f"A splat ({', '.join(endings())}); or the folder of a run, for its frames as splats or, with --web, as a "
-        "page.",
-    )
-    parser.add_argument(
+    add, known = parser.add_argument, ", ".join(endings(written=True))
+    add("source", help=f"a splat ({', '.join(endings())}), or the folder of a run")
+    add(
         "target",
         nargs="?",
-        help=f"File to write; its name ends in one of {', '.join(endings(written=True))}, for a run, unless it is USD, "
-        "with # for the digits of the frame, as in frame_####.spz; or .sway for a film; or with "
-        "--web .html (default: film.html in the folder of the run).",
+        help=f"file to write: {known}, for a run, unless it is USD, with # for the digits of the frame, as in "
+        "frame_####.spz; or .sway for a film; or with --web .html (default: film.html in the folder of the run)",
     )
-    parser.add_argument(
-        "--web",
-        action="store_true",
-        help="Write the run in the folder `source` as a film that a browser plays by itself.",
-    )
-    parser.add_argument(
-        "--live-web",
-        action="store_true",
-        help="Write the scene `source` as a page that simulates it in a browser; `export --live-web --help` has its "
-        "options.",
-    )
-    parser.add_argument(
+    add("--web", action="store_true", help="write a run as a film that a browser plays by itself")
+    add("--live-web", action="store_true", help="write a page that simulates; `export --live-web --help` has more")
+    add(
         "--player",
         action="store_true",
-        help="Write what plays .sway files elsewhere into the folder `source`: modules for three.js with Spark "
-        "and for PlayCanvas, and the element <gaussian-swaying>, which also shows pages that simulate.",
+        help="write what plays .sway files elsewhere into the folder `source`: modules for three.js with Spark and for "
+        "PlayCanvas, and the element <gaussian-swaying>, which also shows pages that simulate",
     )
-    parser.add_argument(
-        "--apart",
-        action="store_true",
-        help="Write the Gaussians of a run that never move once, with `still` for the number, and the others for each "
-        "frame.",
-    )
-    parser.add_argument(
-        "--up",
-        nargs=3,
-        type=float,
-        metavar=("X", "Y", "Z"),
-        help="Direction in the scene that points up, for USD and glTF; default: that of the run, or z.",
-    )
-    parser.add_argument(
-        "--metres-per-unit",
-        type=float,
-        help="Length of a scene unit [m], for USD and glTF; default: that of the run, or 1.",
-    )
-    parser.add_argument(
-        "--spz-version",
-        type=int,
-        choices=VERSIONS,
-        help="Version of an .spz file; default: 3, which most programs read.",
-    )
+    apart = "write the Gaussians that never move once, with `still` for the number, and the others for each frame"
+    add("--apart", action="store_true", default=None, help=apart)
+    add("--up", nargs=3, type=float, metavar=("X", "Y", "Z"), help="up in the scene, for USD and glTF; default: z")
+    add("--metres-per-unit", type=float, help="length of a scene unit [m], for USD and glTF; default: 1")
+    add("--spz-version", type=int, choices=WRITTEN, help="of an .spz file; default: 3, which most programs read")
     return parser
 
 
@@ -107,40 +79,30 @@ def export(options: argparse.Namespace) -> None:
     """Convert, and report the file."""
     if options.player:
         return print("\n".join(f"wrote {path}" for path in write_player(Path(options.source))))
-    given = {"--up": options.up, "--metres-per-unit": options.metres_per_unit}
-    if options.web or Path(options.target or "").suffix == ".sway":
-        refuse("a film", given | {"--spz-version": options.spz_version, "--apart": options.apart or None})
-        return export_web(options)
-    if options.target is None:
+    film = options.web or Path(options.target or "").suffix == ".sway"
+    if options.target is None and not film:
         raise ValueError(f"Expected a file to write, whose name ends in one of {', '.join(endings(written=True))}.")
-    format = FORMATS[format_of(options.target)]
-    if "spz_version" not in format.options and options.spz_version is not None:
-        raise ValueError("--spz-version is only for .spz files: leave it out.")
-    if Path(options.source).is_dir():
-        refuse("a run", given)
-        return export_run(options)
-    if options.apart:
-        raise ValueError("--apart is only for the frames of a run: leave it out.")
-    if not format.in_metres and any(value is not None for value in given.values()):
-        raise ValueError(
-            "--up and --metres-per-unit are only for USD and glTF, as other formats have no up direction: leave them "
-            "out, or use a target that ends in .usdc or .glb."
-        )
-    metres = 1.0 if options.metres_per_unit is None else options.metres_per_unit
-    check_positive("--metres-per-unit", metres)
-    frame = SimFrame.fit(torch.zeros(1, 3), options.up or (0.0, 0.0, 1.0), metres_per_unit=metres)
-    place: dict[str, Any] = {"metres_per_unit": metres, "rotation": frame.rotation}
-    export_cloud(options.target, read_gaussians(options.source), spz_version=options.spz_version or 3, **place)
-    if format.in_metres:
-        tell(frame, "as given" if any(given.values()) else "by default")
-    print(f"wrote {options.target}")
-
-
-def refuse(what: str, given: dict[str, Any]) -> None:
-    """Raise ValueError if an option was given that only other exports have."""
-    for name, value in given.items():
-        if value is not None:
-            raise ValueError(f"{name} is not for {what}, which needs none: leave it out.")
+    what = "a film" if film else "the frames of a run" if Path(options.source).is_dir() else "a splat"
+    format = None if film else FORMATS[format_of(options.target)]
+    known = () if format is None else (*format.options, "apart", *(["up"] if format.in_metres else []))
+    for name in ("up", "metres_per_unit", "spz_version", "apart"):
+        if vars(options)[name] is not None and name not in {*TAKEN[what].split()}.intersection(known):
+            where = f" as {Path(options.target).suffix}" if format else ""
+            raise ValueError(f"--{name.replace('_', '-')} is not for {what}{where}: leave it out.")
+    place: dict[str, Any] = {"spz_version": options.spz_version or 3}
+    if format is None:
+        export_web(options)
+    elif what == "a splat":
+        metres = 1.0 if options.metres_per_unit is None else options.metres_per_unit
+        check_positive("--metres-per-unit", metres)
+        frame = SimFrame.fit(torch.zeros(1, 3), options.up or (0.0, 0.0, 1.0), metres_per_unit=metres)
+        place |= {"metres_per_unit": metres, "rotation": frame.rotation}
+        export_cloud(options.target, read_gaussians(options.source), **place)
+        if format.in_metres:
+            tell(frame, "by default" if options.up is None and options.metres_per_unit is None else "as given")
+        print(f"wrote {options.target}")
+    else:
+        export_run(options, format, place)
 
 
 def tell(frame: SimFrame, origin: str) -> None:
@@ -149,22 +111,20 @@ def tell(frame: SimFrame, origin: str) -> None:
     print(f"up {up}, 1 scene unit = {frame.metres_per_unit:.6g} m ({origin})")
 
 
-def export_run(options: argparse.Namespace) -> None:
+def export_run(options: argparse.Namespace, format: Format, place: dict[str, Any]) -> None:
     """Write the frames of a run, and report the files."""
-    target, format = Path(options.target), FORMATS[format_of(options.target)]
-    run = RecordedRun(Path(options.source))
-    frame, fps = run.simulation.scene.frame, 1 / run.simulation.frame_dt
-    place: dict[str, Any] = {"metres_per_unit": frame.metres_per_unit, "rotation": frame.rotation}
-    place["spz_version"] = options.spz_version or 3
-    still = target.with_name(numbered(target.name, "still"))
-    apart = options.apart and not format.film and not run.simulation.scene.all_move
+    target, run = Path(options.target), RecordedRun(Path(options.source))
+    scene, fps = run.simulation.scene, 1 / run.simulation.frame_dt
+    place |= {"metres_per_unit": scene.frame.metres_per_unit, "rotation": scene.frame.rotation}
+    apart = options.apart and not format.film and not scene.all_move
     frames = (moved.part_to_cloud(moving=True) if apart else moved.to_cloud() for moved in run.frames())
     files = export_frames(target, frames, fps, **place)
     if apart:
-        export_cloud(still, run.simulation.scene.rest().part_to_cloud(moving=False), **place)
+        still = target.with_name(numbered(target.name, "still"))
+        export_cloud(still, scene.rest().part_to_cloud(moving=False), **place)
         print(f"wrote {still}, which never moves")
     if format.in_metres:
-        tell(frame, "from the run")
+        tell(scene.frame, "from the run")
     print(f"wrote {target}, {len(files)} files" if len(files) > 1 else f"wrote {target}")
 
 

@@ -190,7 +190,7 @@ def splat_name(path: str | Path) -> str:
     Folders ``iteration_30000`` and ``point_cloud``, as 3DGS makes them, are skipped.
     """
     file = Path(path)
-    if file.stem not in ("point_cloud", "meta", "lod-meta"):
+    if file.stem not in ("point_cloud", "meta"):
         return file.stem
     folders = [part.name for part in file.resolve().parents]
     passed = ("point_cloud", "iteration_")

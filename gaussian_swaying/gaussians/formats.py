@@ -113,10 +113,8 @@ class Format:
 
 
 def _steps_of_spz(cloud: GaussianCloud, spz_version: int) -> Tensor:
-    places = cloud.means.double().abs()
-    if spz_version > 1:
-        return torch.full_like(places[:, 0], 2.0 ** -fraction_bits(float(places.max())))
-    return places.amax(-1) * 2.0**-10
+    farthest = float(cloud.means.double().abs().max())
+    return torch.full_like(cloud.opacities, 2.0 ** -fraction_bits(farthest), dtype=torch.float64)
 
 
 def _steps_of_sog(cloud: GaussianCloud) -> Tensor:
@@ -284,6 +282,9 @@ def cleaned(path: Path, cloud: GaussianCloud) -> GaussianCloud:
     What has no meaning is left out with a warning, see :func:`~gaussian_swaying.gaussians.repair.repaired`. Logits of
     opacities are clamped to ±16, where float32 ends.
 
+    Args:
+        path: The file, for messages.
+
     Returns:
         The same, or a smaller cloud, with quaternions of unit length.
     """
@@ -362,6 +363,11 @@ def export_frames(
     Args:
         path: File to write: for USD one with all frames; otherwise its name has ``#`` in place of the digits of the
             frame, counted from 0: ``frame_####.spz`` makes frame_0000.spz, frame_0001.spz, ... Its folder is made.
+        clouds: One for each frame; read one by one.
+        fps: Frames per second, for USD.
+
+    Returns:
+        The files.
     """
     target, format = Path(path), FORMATS[format_of(path)]
     if not format.film and "#" not in target.name:

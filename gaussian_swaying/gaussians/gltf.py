@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-import binascii
+import functools
 import json
 import os
 import struct
@@ -20,7 +20,7 @@ from torch import Tensor
 from gaussian_swaying._inputs import LARGEST_HEAD, check_regular, parse_json, read_json
 from gaussian_swaying.gaussians.cloud import GaussianCloud, joined
 from gaussian_swaying.gaussians.harmonics import SH_DC, rotate_sh
-from gaussian_swaying.gaussians.packed import check_count, logits, size_logarithms
+from gaussian_swaying.gaussians.packed import check_count, logits, size_logarithms, usable
 from gaussian_swaying.gaussians.repair import cloud_of, repaired
 from gaussian_swaying.geometry.covariances import covariance, covariance_to_quat_scale, deform_covariance
 from gaussian_swaying.geometry.origin import origin_of
@@ -31,8 +31,7 @@ LARGEST = 1 << 32  # bytes of a .glb file
 _GLB = struct.Struct("<4sII")  # magic, version, length; then chunks of a length, a kind and data
 _CHUNK = struct.Struct("<I4s")
 _UNDERSTOOD = (_EXTENSION, "KHR_mesh_quantization")
-_TYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5126: np.float32}
-_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _UPRIGHT = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)  # z up to y up
 _STEPS = 1 << 22  # opacities in float32 end half of such a step before 0 and 1
 
@@ -46,18 +45,26 @@ def read_gltf(path: str | os.PathLike[str]) -> GaussianCloud:
         The Gaussians as float32 tensors on the CPU, without normals.
     """
     path = check_regular(path, "the glTF file")
-    document = _Document(path)
-    found = list(document.primitives())
-    if not found:
-        raise ValueError(f"{path} has no primitive with `{_EXTENSION}`; export it as Gaussian splats.")
-    degrees = [_degree(path, primitive["attributes"]) for primitive, _ in found]
-    counts = [document.count(primitive["attributes"]["POSITION"]) for primitive, _ in found]
-    width = (max(degrees) + 1) ** 2
-    check_count(path, sum(counts), width)
-    if not sum(counts):
-        raise ValueError(f"{path} holds zero Gaussians; export the scene again.")
-    parts = [document.gaussians(*what, width) for what, count in zip(found, counts, strict=True) if count]
-    return joined(*parts)
+    with usable(path, "glTF file"):
+        root, binary = _opened(path)
+        needed = [name for name in root.get("extensionsRequired", []) if name not in _UNDERSTOOD]
+        if needed:
+            raise ValueError(
+                f"{path} requires the extensions {str(needed)[:80]} (`extensionsRequired`); export without."
+            )
+        found = list(_primitives(path, root))
+        if not found:
+            raise ValueError(f"{path} has no primitive with `{_EXTENSION}`; export it as Gaussian splats.")
+        names = [primitive["attributes"] for primitive, _ in found]
+        counts = [root["accessors"][attributes["POSITION"]]["count"] for attributes in names]
+        width = (max(map(_degree, names)) + 1) ** 2
+        check_count(path, sum(counts), width)
+        if not sum(counts):
+            raise ValueError(f"{path} holds zero Gaussians; export the scene again.")
+        buffers = functools.cache(functools.partial(_buffer, path, root, binary))
+        read = functools.partial(_numbers, root, buffers)
+        parts = zip(names, found, counts, strict=True)
+        return joined(*(_gaussians(path, read, own, matrix, width) for own, (_, matrix), count in parts if count))
 
 
 def encode_gltf(cloud: GaussianCloud, rotation: Tensor | None = None, metres_per_unit: float = 1.0) -> bytes:
@@ -68,6 +75,9 @@ def encode_gltf(cloud: GaussianCloud, rotation: Tensor | None = None, metres_per
     Args:
         rotation: Rotation from scene directions to z up, shape (3, 3); the scene's z is up if None.
         metres_per_unit: Length of a scene unit [m].
+
+    Returns:
+        The content of the file.
     """
     turn = _UPRIGHT if rotation is None else _UPRIGHT @ rotation.to("cpu", torch.float64)
     cloud = _moved(cloud.to("cpu", torch.float32), turn * metres_per_unit, torch.zeros(3, dtype=torch.float64))
@@ -121,258 +131,138 @@ def encode_gltf(cloud: GaussianCloud, rotation: Tensor | None = None, metres_per
     return head + b"".join(data)
 
 
-class _Document:
-    """A glTF document and its buffers; whatever is missing or wrong in it is a ValueError that names the file."""
+def _opened(path: Path) -> tuple[dict[str, Any], np.ndarray]:
+    with path.open("rb") as stream:
+        if stream.read(4) != b"glTF":
+            return read_json(path, "glTF file"), np.empty(0, np.uint8)
+    data, size = np.memmap(path, dtype=np.uint8, mode="r"), path.stat().st_size
+    _, version, length = _GLB.unpack(data[: _GLB.size].tobytes())
+    if version != 2 or length != size:
+        raise ValueError(f"`version` {version} with a `length` of {length:,} bytes, but there are {size:,}")
+    chunks, start = list[np.ndarray](), _GLB.size
+    while start + _CHUNK.size <= size and len(chunks) < 2:  # the document and the data
+        count, _ = _CHUNK.unpack(data[start : start + _CHUNK.size].tobytes())
+        start += _CHUNK.size + count
+        if start > size:
+            raise ValueError(f"a part of {count:,} bytes is announced, but the file ends before")
+        chunks.append(data[start - count : start])
+    if len(chunks[0]) > LARGEST_HEAD:
+        raise ValueError("its JSON is too large")
+    return parse_json(chunks[0].tobytes(), "glTF file", path), chunks[-1]
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._buffers: dict[int, np.ndarray] = {}
-        self._spans: dict[int, tuple[int, int, int]] = {}  # buffer, first byte and end of each view
-        with path.open("rb") as stream:
-            binary = stream.read(4) == b"glTF"
-        self.root = self._chunks() if binary else read_json(path, "glTF file")
-        if not isinstance(self.root, dict):
-            raise self.broken("it is not a table of keys")
-        needed = [name for name in self._list(self.root, "extensionsRequired") if name not in _UNDERSTOOD]
-        if needed:
-            raise ValueError(
-                f"{path} requires the extensions {str(needed)[:80]} (`extensionsRequired`); export without."
-            )
 
-    def broken(self, what: str) -> ValueError:
-        return ValueError(f"{self.path} is not a usable glTF file ({what}); export it again.")
-
-    def _chunks(self) -> Any:
-        size = self.path.stat().st_size
-        data = np.memmap(self.path, dtype=np.uint8, mode="r")
-        if size < _GLB.size + _CHUNK.size:
-            raise self.broken(f"it ends after {size} bytes")
-        _, version, length = _GLB.unpack(data[: _GLB.size].tobytes())
-        if version != 2 or length != size:
-            raise self.broken(f"`version` {version} with a `length` of {length:,} bytes, but there are {size:,}")
-        start, chunks = _GLB.size, dict[bytes, np.ndarray]()
-        while start + _CHUNK.size <= length:
-            count, kind = _CHUNK.unpack(data[start : start + _CHUNK.size].tobytes())
-            start += _CHUNK.size
-            if start + count > length:
-                raise self.broken(f"a part of {count:,} bytes is announced, but {length - start:,} follow")
-            chunks.setdefault(kind, data[start : start + count])
-            start += count
-        if start < length:
-            raise self.broken(f"{length - start} bytes follow its last part")
-        if len(chunks.get(b"JSON", ())) == 0 or len(chunks[b"JSON"]) > LARGEST_HEAD:
-            raise self.broken("its JSON is missing or too large")
-        if b"BIN\0" in chunks:
-            self._buffers[0] = chunks[b"BIN\0"]
-        return parse_json(chunks[b"JSON"].tobytes(), "glTF file", self.path)
-
-    # ---- parts of the document
-
-    def item(self, kind: str, index: Any) -> dict[str, Any]:
-        entries = self.root.get(kind)
-        if not isinstance(entries, list) or type(index) is not int or not 0 <= index < len(entries):
-            raise self.broken(f"`{kind}` has no entry {str(index)[:20]}")
-        if not isinstance(entries[index], dict):
-            raise self.broken(f"`{kind}` {index} is no table of keys")
-        return entries[index]
-
-    def whole(self, holder: dict[str, Any], name: str, default: int | None = None) -> int:
-        value = holder.get(name, default)
-        if type(value) is not int or value < 0:
-            raise self.broken(f"`{name}` is {str(value)[:20]}")
-        return value
-
-    def primitives(self) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-        """The primitives with Gaussians in the scene, and the transformation of each, shape (4, 4)."""
-        scenes, nodes = self.root.get("scenes"), self.root.get("nodes")
-        if scenes:
-            first = self.item("scenes", self.whole(self.root, "scene", 0)).get("nodes", [])
-        else:
-            listed = nodes if isinstance(nodes, list) else []
-            below = [self._list(self.item("nodes", index), "children") for index in range(len(listed))]
-            first = sorted(set(range(len(listed))) - {child for row in below for child in row if type(child) is int})
-        open_, seen = [(index, np.eye(4)) for index in reversed(first if isinstance(first, list) else [])], set()
-        while open_:
-            index, matrix = open_.pop()
-            node = self.item("nodes", index)
-            if index in seen:
-                raise self.broken(f"node {index} is there twice")
-            seen.add(index)
-            with np.errstate(over="ignore", invalid="ignore"):
-                matrix = matrix @ self._matrix(node)
-            open_ += [(child, matrix) for child in reversed(self._list(node, "children"))]
-            if "mesh" in node:
-                for primitive in self._list(self.item("meshes", node["mesh"]), "primitives"):
-                    extensions = primitive.get("extensions") if isinstance(primitive, dict) else None
-                    if isinstance(extensions, dict) and _EXTENSION in extensions:
-                        self._check_primitive(primitive, extensions[_EXTENSION])
-                        yield primitive, matrix
-
-    def _list(self, holder: dict[str, Any], name: str) -> list[Any]:
-        value = holder.get(name, [])
-        if not isinstance(value, list):
-            raise self.broken(f"`{name}` is no list")
-        return value
-
-    def _matrix(self, node: dict[str, Any]) -> np.ndarray:
-        """Transformation of a node within its parent, shape (4, 4)."""
-        defaults = {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1], "scale": [1, 1, 1], "matrix": [*np.eye(4).flat]}
-        values = {}
-        for name, default in defaults.items():
-            try:
-                values[name] = np.array(node.get(name, default), dtype=np.float64)
-            except (ValueError, TypeError, OverflowError):
-                raise self.broken(f"`{name}` of a node is no list of numbers") from None
-            if values[name].shape != (len(default),) or not np.isfinite(values[name]).all():
-                raise self.broken(f"`{name}` of a node is not {len(default)} finite numbers")
-        if not values["rotation"].any():
-            raise self.broken("`rotation` of a node is zero")
-        turn = quat_to_rotation(torch.from_numpy(values["rotation"][[3, 0, 1, 2]])).numpy()
-        matrix = values["matrix"].reshape(4, 4).T.copy()
-        own = np.eye(4)
-        own[:3, :3], own[:3, 3] = turn * values["scale"], values["translation"]
+def _primitives(path: Path, root: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
+    """The primitives with Gaussians in the scene, and the transformation of each, shape (4, 4)."""
+    nodes = root["nodes"]
+    if root.get("scenes"):
+        first = root["scenes"][root.get("scene", 0)]["nodes"]
+    else:
+        first = sorted(set(range(len(nodes))) - {child for node in nodes for child in node.get("children", [])})
+    waiting, seen = [(index, np.eye(4)) for index in reversed(first)], set[int]()
+    while waiting:
+        index, matrix = waiting.pop()
+        node = nodes[index]
+        if index in seen:
+            raise ValueError(f"node {index} is there twice")
+        seen.add(index)
         with np.errstate(over="ignore", invalid="ignore"):
-            product: np.ndarray = matrix @ own
-        return product
+            matrix = matrix @ _matrix(node)
+        waiting += [(child, matrix) for child in reversed(node.get("children", []))]
+        for primitive in root["meshes"][node["mesh"]]["primitives"] if "mesh" in node else ():
+            kind = primitive.get("extensions", {}).get(_EXTENSION)
+            if kind is None:
+                continue
+            if primitive.get("mode", 4) != 0 or "indices" in primitive:
+                raise ValueError(f"`mode` {primitive.get('mode', 4)} of Gaussians is not 0, or they have `indices`")
+            if kind.get("extensions"):
+                raise ValueError(
+                    f"{path} stores its Gaussians by the extensions {str(list(kind['extensions']))[:80]}; export it "
+                    "without them."
+                )
+            if kind.get("kernel", "ellipse") != "ellipse":
+                raise ValueError(f"{path} has Gaussians of the kernel {str(kind['kernel'])[:40]!r}; export `ellipse`.")
+            if kind.get("colorSpace") == "lin_rec709_display":
+                told = f"{path} has colours in linear light, which are shown as they are: it looks too dark."
+                warnings.warn(told, UserWarning, stacklevel=3)
+            yield primitive, matrix
 
-    def _check_primitive(self, primitive: dict[str, Any], kind: Any) -> None:
-        if not isinstance(kind, dict) or not isinstance(primitive.get("attributes"), dict):
-            raise self.broken(f"`{_EXTENSION}` or `attributes` of a primitive is no table of keys")
-        mode = primitive.get("mode", 4)
-        if mode != 0 or "indices" in primitive:
-            raise self.broken(f"`mode` {str(mode)[:20]} of a primitive with Gaussians is not 0, or it has `indices`")
-        if kind.get("extensions"):
-            names = str(list(kind["extensions"]) if isinstance(kind["extensions"], dict) else kind["extensions"])[:80]
-            raise ValueError(f"{self.path} stores its Gaussians by the extensions {names}; export it without them.")
-        if kind.get("kernel", "ellipse") != "ellipse":
-            raise ValueError(f"{self.path} has Gaussians of the kernel {str(kind['kernel'])[:40]!r}; export `ellipse`.")
-        if kind.get("colorSpace") == "lin_rec709_display":
-            warnings.warn(
-                f"{self.path} has colours in linear light, which are shown as they are: it looks too dark.",
-                UserWarning,
-                stacklevel=4,
-            )
 
-    # ---- numbers
+def _matrix(node: dict[str, Any]) -> np.ndarray:
+    """Transformation of a node within its parent, shape (4, 4)."""
+    turn = quat_to_rotation(torch.tensor(node.get("rotation", [0, 0, 0, 1]), dtype=torch.float64)[[3, 0, 1, 2]])
+    own = np.eye(4)
+    own[:3, :3], own[:3, 3] = turn.numpy() * node.get("scale", [1, 1, 1]), node.get("translation", [0, 0, 0])
+    product: np.ndarray = np.array(node.get("matrix", np.eye(4).ravel()), dtype=np.float64).reshape(4, 4).T @ own
+    return product
 
-    def count(self, index: Any) -> int:
-        return self.whole(self.item("accessors", index), "count")
 
-    def gaussians(self, primitive: dict[str, Any], matrix: np.ndarray, width: int) -> GaussianCloud:
-        names, path = primitive["attributes"], self.path
-        count = self.count(names["POSITION"])
+def _gaussians(path: Path, read: Any, names: dict[str, Any], matrix: np.ndarray, width: int) -> GaussianCloud:
+    """The Gaussians of a primitive.
 
-        def column(name: str, kind: str) -> np.ndarray:
-            if name not in names:
-                raise ValueError(f"{path} has no attribute `{name}`, so it is not a splat; export it again.")
-            return self._accessor(names[name], kind, count, name)[0]
+    Args:
+        read: Gives the numbers of an accessor, see :func:`_numbers`.
+        names: Its accessors.
+        matrix: Its transformation, shape (4, 4).
+        width: Number of harmonics.
+    """
+    means, _ = read(names["POSITION"], 3)
+    opacity, steps = read(names[f"{_EXTENSION}:OPACITY"], 1)
+    scales, others = size_logarithms(read(names[f"{_EXTENSION}:SCALE"], 3)[0], "attribute `SCALE`")
+    outside = ~(np.abs(opacity[:, 0] - 0.5) <= 0.501)  # and what is not a number
+    others["attribute `OPACITY` is not from 0 to 1 (store the opacity itself, not its logit)"] = outside
+    sh = np.zeros((len(means), width, 3), dtype=np.float32)
+    for place, name in enumerate(_harmonics(_degree(names))):
+        sh[:, place] = read(names[name], 3)[0]
+    quats = read(names[f"{_EXTENSION}:ROTATION"], 4)[0][:, [3, 0, 1, 2]]
+    opacities = logits(opacity[:, 0], steps)
+    cloud = cloud_of(path, others, means=means, quats=quats, scales=scales, opacities=opacities, sh=sh)
+    lengths = np.linalg.norm(matrix[:3, :3], axis=0)
+    if not (np.isfinite(matrix).all() and lengths.all()):
+        raise ValueError("the transformation of a node is singular or infinite")
+    turn = matrix[:3, :3] / lengths
+    if np.abs(turn.T @ turn - np.eye(3)).max() > 1e-3 or np.linalg.det(turn) < 0:
+        raise ValueError(f"{path} shears or mirrors its Gaussians by a node; apply that before the export.")
+    moved = _moved(cloud, *map(torch.from_numpy, (matrix[:3, :3].copy(), matrix[:3, 3].copy())))
+    return moved if moved is cloud else repaired(path, moved)
 
-        opacity, steps = self._accessor(names.get(f"{_EXTENSION}:OPACITY"), "SCALAR", count, "OPACITY")
-        sizes = column(f"{_EXTENSION}:SCALE", "VEC3")
-        scales, others = size_logarithms(sizes, "attribute `SCALE`")
-        outside = ~(np.abs(opacity[:, 0] - 0.5) <= 0.501)  # and what is not a number
-        others["attribute `OPACITY` is not from 0 to 1 (store the opacity itself, not its logit)"] = outside
-        sh = np.zeros((count, width, 3), dtype=np.float32)
-        for place, name in enumerate(_harmonics(_degree(path, names))):
-            sh[:, place] = column(name, "VEC3")
-        cloud = cloud_of(
-            path,
-            others,
-            means=column("POSITION", "VEC3"),
-            quats=column(f"{_EXTENSION}:ROTATION", "VEC4")[:, [3, 0, 1, 2]],
-            scales=scales,
-            opacities=logits(opacity[:, 0], steps),
-            sh=sh,
-        )
-        self._check_turn(matrix)
-        moved = _moved(cloud, *map(torch.from_numpy, (matrix[:3, :3].copy(), matrix[:3, 3].copy())))
-        return moved if moved is cloud else repaired(path, moved)
 
-    def _check_turn(self, matrix: np.ndarray) -> None:
-        lengths = np.linalg.norm(matrix[:3, :3], axis=0)
-        if not (np.isfinite(matrix).all() and lengths.all()):
-            raise self.broken("the transformation of a node is singular or infinite")
-        turn = matrix[:3, :3] / lengths
-        if np.abs(turn.T @ turn - np.eye(3)).max() > 1e-3 or np.linalg.det(turn) < 0:
-            raise ValueError(f"{self.path} shears or mirrors its Gaussians by a node; apply that before the export.")
+def _numbers(root: dict[str, Any], buffers: Any, index: int, width: int) -> tuple[np.ndarray, int]:
+    """Numbers of an accessor as float32, shape (count, width), and the number of their steps from 0 to 1."""
+    accessor = root["accessors"][index]
+    if "sparse" in accessor or accessor["type"] != ("SCALAR" if width == 1 else f"VEC{width}"):
+        raise ValueError(f"accessor {index} is sparse or not of {width} numbers")
+    dtype, view = np.dtype(_TYPES[accessor["componentType"]]), root["bufferViews"][accessor["bufferView"]]
+    first = view.get("byteOffset", 0)
+    data = buffers(view["buffer"])[first : first + view["byteLength"]]
+    if len(data) == 0:  # for which numpy would make an array of its own
+        raise ValueError(f"the buffer of accessor {index} is too short")
+    stride = view.get("byteStride", width * dtype.itemsize), dtype.itemsize
+    rows: np.ndarray = np.ndarray((accessor["count"], width), dtype, data, accessor.get("byteOffset", 0), stride)
+    values = rows.astype(np.float32)
+    if not accessor.get("normalized") or dtype.kind == "f":
+        return values, _STEPS
+    top = int(np.iinfo(dtype).max)
+    return np.maximum(values / np.float32(top), -1), top
 
-    def _accessor(self, index: Any, kind: str, count: int, name: str) -> tuple[np.ndarray, int]:
-        """Numbers of an accessor as float32, shape (count, width), and the number of their steps from 0 to 1."""
-        accessor = self.item("accessors", index)
-        number = self.whole(accessor, "componentType")
-        if accessor.get("type") != kind or number not in _TYPES or self.count(index) != count:
-            raise self.broken(f"attribute `{name}` is not {count:,} of {kind} in a `componentType` that it may have")
-        if "sparse" in accessor or "bufferView" not in accessor:
-            raise ValueError(f"{self.path}: attribute `{name}` is sparse; export the Gaussians without `sparse`.")
-        view = self.item("bufferViews", accessor["bufferView"])
-        buffer = self._buffer(self.whole(view, "buffer"))
-        dtype, width = np.dtype(_TYPES[number]).newbyteorder("<"), _WIDTHS[kind]
-        row = width * dtype.itemsize
-        stride = self.whole(view, "byteStride", row)
-        first, length = self.whole(view, "byteOffset", 0), self.whole(view, "byteLength")
-        inner = self.whole(accessor, "byteOffset", 0)
-        needed = inner + (stride * (count - 1) + row if count else 0)
-        if stride < row or needed > length or first + length > len(buffer):
-            raise self.broken(f"attribute `{name}` announces {count:,} rows, but its buffer has {len(buffer):,} bytes")
-        if (first + inner) % dtype.itemsize or stride % dtype.itemsize:
-            raise self.broken(f"attribute `{name}` has a `byteOffset` or a `byteStride` between two numbers")
-        if "byteStride" not in view:
-            place = accessor["bufferView"]
-            self._spans[place] = (view["buffer"], first, first + length)
-            for index, (other, start, end) in self._spans.items():
-                if other == view["buffer"] and index != place and start < first + length and first < end:
-                    raise self.broken(f"attribute `{name}` has a `byteOffset` within the numbers of another one")
-        shared = [
-            a for a in self.root["accessors"] if isinstance(a, dict) and a.get("bufferView") == accessor["bufferView"]
-        ]
-        if length >= needed + stride and len(shared) == 1:
-            raise self.broken(
-                f"attribute `{name}` has a `count` of {count:,}, but its view has a `byteLength` for more"
-            )
-        rows = np.ndarray((count, width), dtype, buffer, first + inner, (stride, dtype.itemsize))
-        values = rows.astype(np.float32)
-        if not accessor.get("normalized") or number == 5126:
-            return values, _STEPS
-        top = np.iinfo(dtype).max
-        return np.maximum(values / np.float32(top), -1), int(top)
 
-    def _buffer(self, index: int) -> np.ndarray:
-        entry = self.item("buffers", index)
-        announced = self.whole(entry, "byteLength")
-        if index not in self._buffers:
-            uri = entry.get("uri")
-            if not isinstance(uri, str):
-                raise self.broken(f"buffer {index} has no data")
-            if uri.startswith("data:"):
-                try:
-                    data = base64.b64decode(uri.partition(",")[2], validate=True)
-                except binascii.Error:
-                    raise self.broken(f"buffer {index} is not in base64") from None
-                self._buffers[index] = np.frombuffer(data, dtype=np.uint8)
-            else:
-                name = unquote(uri)
-                if Path(name).name != name or name in ("", ".", ".."):
-                    raise ValueError(f"{self.path} takes its data from {name[:80]!r}; put that file beside it.")
-                beside = check_regular(self.path.with_name(name), "the buffer")
-                self._buffers[index] = np.fromfile(beside, dtype=np.uint8)
-        found = self._buffers[index]
-        if not announced <= len(found) < announced + 4:  # padding
-            raise self.broken(f"buffer {index} has a `byteLength` of {announced:,}, but its data {len(found):,} bytes")
-        return found[:announced]
+def _buffer(path: Path, root: dict[str, Any], binary: np.ndarray, index: int) -> np.ndarray:
+    uri = root["buffers"][index].get("uri")
+    if uri is None:
+        return binary
+    if uri.startswith("data:"):
+        return np.frombuffer(base64.b64decode(uri.partition(",")[2], validate=True), dtype=np.uint8)
+    name = unquote(uri)
+    if Path(name).name != name or name in ("", ".", ".."):
+        raise ValueError(f"{path} takes its data from {name[:80]!r}; put that file beside it.")
+    return np.fromfile(check_regular(path.with_name(name), "the buffer"), dtype=np.uint8)
 
 
 def _harmonics(degree: int) -> list[str]:
     return [f"{_EXTENSION}:SH_DEGREE_{band}_COEF_{k}" for band in range(degree + 1) for k in range(2 * band + 1)]
 
 
-def _degree(path: Path, names: dict[str, Any]) -> int:
-    if "POSITION" not in names:
-        raise ValueError(f"{path} has no attribute `POSITION`, so it is not a splat; export it again.")
-    degree = max((band for band in range(4) if any(f":SH_DEGREE_{band}_" in name for name in names)), default=0)
-    for name in _harmonics(degree):
-        if name not in names:
-            raise ValueError(f"{path} has no attribute `{name}`, but others up to degree {degree}; export it again.")
-    return degree
+def _degree(names: dict[str, Any]) -> int:
+    return max((band for band in range(4) if any(f":SH_DEGREE_{band}_" in name for name in names)), default=0)
 
 
 def _moved(cloud: GaussianCloud, matrix: Tensor, shift: Tensor) -> GaussianCloud:

@@ -1,19 +1,36 @@
-"""Common to the small formats: quaternions without their largest component, opacities in steps."""
+"""Common to the small formats: damaged files, quaternions without their largest component, opacities in steps."""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from gaussian_swaying._checks import one_line
 from gaussian_swaying._inputs import check_unpacked
 
 _PEAK = 5  # memory while a file is read, in sizes of its Gaussians
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # places of the small ones for each of the largest
 _PLACES = np.array([[3, 0, 1, 2], [0, 3, 1, 2], [0, 1, 3, 2], [0, 1, 2, 3]])  # where 3 stands for the largest
+
+
+@contextmanager
+def usable(path: Path, kind: str) -> Iterator[None]:
+    """Turn what goes wrong while a damaged file is read into a sentence that names it, unless it is one already."""
+    try:
+        yield
+    except (FileNotFoundError, ImportError, MemoryError):
+        raise
+    except Exception as error:
+        if str(path) in str(error):
+            raise
+        what = f"it has no `{error.args[0]}`" if isinstance(error, KeyError) else one_line(error).rstrip(".")
+        raise ValueError(f"{path} is not a usable {kind} ({what}); export it again.") from error
 
 
 def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

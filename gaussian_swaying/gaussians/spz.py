@@ -6,7 +6,6 @@ import gzip
 import os
 import struct
 import warnings
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -19,19 +18,19 @@ from gaussian_swaying.gaussians.packed import (
     floats,
     logits,
     smallest_three,
+    usable,
     warn_antialiased,
     with_largest,
 )
 from gaussian_swaying.gaussians.repair import cloud_of
 
-VERSIONS = (1, 2, 3, 4)
+WRITTEN = (2, 3, 4)
 _MAGIC = b"NGSP"
 _HEAD = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, fractional bits, flags, streams
 _TABLE = 32  # offset of the table of streams in a file of version 4 without extensions
 _ANTIALIASED, _EXTENDED = 1, 2  # flags
 _AXES = 0xADBE0003  # the extension SPZ_ADOBE_coordinate_system
 COLOR_SCALE = 0.15  # wider than that of the harmonics, as colours may be beyond 0 and 1
-_DEFLATED = 1032  # bytes that one of gzip stands for at the most
 _LARGEST_EXTENSIONS = 1 << 24  # bytes
 _BITS = (5, 4)  # of harmonics of band 1 and above, as Niantic's writer keeps by default
 
@@ -47,35 +46,27 @@ def read_spz(path: str | os.PathLike[str]) -> GaussianCloud:
         The Gaussians as float32 tensors on the CPU, without normals.
     """
     path = check_regular(path, "the .spz file")
-    with path.open("rb") as stream:
-        start = stream.read(4)
-    if start[:2] == b"\x1f\x8b":
-        head, parts, extensions = _unzipped(path)
-    elif start == _MAGIC:
-        head, parts, extensions = _streams(path, path.read_bytes())
-    else:
-        raise ValueError(f"{path} is not an .spz file (it starts neither as gzip nor with `NGSP`); export it again.")
-    _, version, count, degree, fraction, flags, _ = head
-    _check_axes(path, extensions)
-    if flags > _ANTIALIASED | _EXTENDED:
-        warnings.warn(f"{path}: ignored the unknown `flags` {flags:#x} of its header.", UserWarning, stacklevel=2)
-    if flags & _ANTIALIASED:
-        warn_antialiased(path)
-    if degree == 4:
-        warnings.warn(f"{path}: ignored the harmonics of degree 4; those up to 3 are used.", UserWarning, stacklevel=2)
-    positions, alphas, colors, scales, rotations, rest = parts
-    sh = np.empty((count, (min(degree, 3) + 1) ** 2, 3), dtype=np.float32)
-    sh[:, 0] = ((colors / 255 - 0.5) / COLOR_SCALE).reshape(count, 3)
-    sh[:, 1:] = rest.reshape(count, -1, 3)[:, :15]
-    sh[:, 1:] = (sh[:, 1:] - 128) / 128
-    return cloud_of(
-        path,
-        means=_half(positions) if version == 1 else _fixed(positions, fraction),
-        quats=_from_three(rotations) if version < 3 else _from_smallest(rotations),
-        scales=scales.reshape(count, 3) / 16 - 10,
-        opacities=logits(alphas / 255, 255),
-        sh=sh,
-    )
+    with usable(path, ".spz file"):
+        (_, version, count, degree, fraction, flags, _), parts, extensions = _opened(path)
+        _check_axes(path, extensions)
+        if flags & _ANTIALIASED:
+            warn_antialiased(path)
+        if degree == 4:
+            told = f"{path}: ignored the harmonics of degree 4; those up to 3 are used."
+            warnings.warn(told, UserWarning, stacklevel=2)
+        positions, alphas, colors, scales, rotations, rest = parts
+        sh = np.empty((count, (min(degree, 3) + 1) ** 2, 3), dtype=np.float32)
+        sh[:, 0] = ((colors / 255 - 0.5) / COLOR_SCALE).reshape(count, 3)
+        sh[:, 1:] = rest.reshape(count, -1, 3)[:, :15]
+        sh[:, 1:] = (sh[:, 1:] - 128) / 128
+        return cloud_of(
+            path,
+            means=positions.view("<f2").reshape(-1, 3) if version == 1 else _fixed(positions, fraction),
+            quats=_from_three(rotations) if version < 3 else _from_smallest(rotations),
+            scales=scales.reshape(count, 3) / 16 - 10,
+            opacities=logits(alphas / 255, 255),
+            sh=sh,
+        )
 
 
 def encode_spz(cloud: GaussianCloud, spz_version: int = 3) -> bytes:
@@ -85,24 +76,26 @@ def encode_spz(cloud: GaussianCloud, spz_version: int = 3) -> bytes:
     between 4.5e-5 and 380 scene units, in steps of 6 %. Harmonics have 5 bits in band 1 and 4 above.
 
     Args:
-        spz_version: 3 is read by most programs; 4 needs zstandard; 1 and 2 have coarser rotations, and 1 centres in
-            half precision.
+        spz_version: 3 is read by most programs; 4 needs zstandard; 2 has coarser rotations.
+
+    Returns:
+        The content of the file.
     """
-    if spz_version not in VERSIONS:
-        raise ValueError(f"Expected `spz_version` to be 1, 2, 3 or 4, but got {spz_version}.")
+    if spz_version not in WRITTEN:
+        raise ValueError(f"Expected `spz_version` to be 2, 3 or 4, but got {spz_version}.")
     compress = _zstandard().ZstdCompressor(level=12).compress if spz_version == 4 else None
     means, quats, scales, opacities, sh = (
         floats(part) for part in (cloud.means, cloud.quats, cloud.scales, cloud.opacities, cloud.sh)
     )
     farthest = float(np.abs(means).max(initial=0.0))
-    if farthest >= (65504 if spz_version == 1 else 2**23 - 1):
+    if farthest >= 2**23 - 1:
         raise ValueError(
-            f"An .spz file holds centres up to ±8e6 (version 1: ±65504) but one is at {farthest:g}: remove what is far "
-            "away, or choose another format."
+            f"An .spz file holds centres up to ±8e6, but one is at {farthest:g}: remove what is far away, or choose "
+            "another format."
         )
     fraction = fraction_bits(farthest)
     parts = (
-        means.astype("<f2") if spz_version == 1 else _int24(means * np.float64(2.0**fraction)),
+        _int24(means * np.float64(2.0**fraction)),
         _byte(255 / (1 + np.exp(-opacities))),
         _byte(sh[:, 0] * COLOR_SCALE * 255 + 127.5),
         _byte((scales + 10) * 16),
@@ -127,112 +120,67 @@ def fraction_bits(farthest: float) -> int:
 # ---- the container
 
 
+def _opened(path: Path) -> tuple[tuple[Any, ...], list[np.ndarray], bytes]:
+    with path.open("rb") as raw:
+        start = raw.read(4)
+    if start[:2] == b"\x1f\x8b":
+        with gzip.open(path) as stream:
+            head, sizes = _sizes(path, stream.read(_HEAD.size))
+            body, extensions = stream.read(sum(sizes)), stream.read(_LARGEST_EXTENSIONS) if head[5] & _EXTENDED else b""
+            if head[1] == 4:
+                raise ValueError("`version` 4 is not compressed by gzip")
+            if len(body) < sum(sizes) or stream.read(1):  # at the end this compares the checksum
+                raise _other_size(head, sum(sizes), f"{len(body):,} bytes and maybe more follow")
+        return head, np.split(np.frombuffer(body, dtype=np.uint8), np.cumsum(sizes)[:-1]), extensions
+    if start != _MAGIC:
+        raise ValueError(f"{path} is not an .spz file (it starts neither as gzip nor with `NGSP`); export it again.")
+    data = path.read_bytes()
+    head, sizes = _sizes(path, data)
+    zstandard = _zstandard(path)
+    if head[1] != 4:
+        raise ValueError("`version` 1 to 3 is compressed by gzip")
+    (table,) = struct.unpack_from("<I", data, _HEAD.size)
+    place, parts = table + 16 * sum(map(bool, sizes)), []
+    for index, size in enumerate(filter(None, sizes)):
+        length, _ = struct.unpack_from("<QQ", data, table + 16 * index)
+        packed = data[place : place + length]
+        place += length
+        announced = zstandard.frame_content_size(packed)
+        if announced not in (-1, size):
+            raise _other_size(head, size, f"stream {index} has {announced:,}")
+        part = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size, allow_extra_data=False)
+        parts.append(np.frombuffer(part, dtype=np.uint8))
+    if place != len(data) or table < _TABLE:
+        raise _other_size(head, place, f"there are {len(data):,}")
+    return head, [*parts, *([np.empty(0, dtype=np.uint8)] * (len(sizes) - len(parts)))], data[_TABLE:table]
+
+
 def _sizes(path: Path, data: bytes) -> tuple[tuple[Any, ...], list[int]]:
     """The header, checked, and the size of each part [bytes]."""
-    if len(data) < _HEAD.size:
-        raise _truncated(path, _HEAD.size, len(data))
     head = _HEAD.unpack_from(data)
     magic, version, count, degree, fraction = head[:5]
-    if magic != _MAGIC or version not in VERSIONS:
-        raise ValueError(f"{path} is not an .spz file of `version` 1 to 4; export it as one of these.")
+    if magic != _MAGIC or not 1 <= version <= 4 or degree > 4 or fraction > 24:
+        raise ValueError(f"`version` {version}, harmonics of degree {degree}, `fractional_bits` {fraction}")
     if count == 0:
         raise ValueError(f"{path} holds zero Gaussians; export the scene again.")
-    if degree > 4:
-        raise ValueError(f"{path} has harmonics of degree {degree}, but they end at 4; export it again.")
-    if fraction > 24:
-        raise ValueError(f"{path} has centres of 24 bits with `fractional_bits` {fraction}; copy or export it again.")
     check_count(path, count, (degree + 1) ** 2)
     rows = (6 if version == 1 else 9, 1, 3, 3, 3 if version < 3 else 4, 3 * ((degree + 1) ** 2 - 1))
     return head, [count * row for row in rows]
 
 
-def _unzipped(path: Path) -> tuple[tuple[Any, ...], list[np.ndarray], bytes]:
-    """The header, the parts and the extensions of a file of version 1 to 3; decompresses only what it announces."""
-    try:
-        with gzip.open(path) as stream:
-            head, sizes = _sizes(path, stream.read(_HEAD.size))
-            if head[1] == 4:
-                raise ValueError(f"{path} has `version` 4, but is compressed by gzip; copy or export it again.")
-            if sum(sizes) > _DEFLATED * path.stat().st_size:
-                raise _truncated(path, sum(sizes), _DEFLATED * path.stat().st_size)
-            body = bytearray(sum(sizes))
-            found = stream.readinto(body)
-            if found < len(body):
-                raise _truncated(path, len(body), found)
-            extensions = stream.read(_LARGEST_EXTENSIONS) if head[5] & _EXTENDED else b""
-            more = stream.read(1)  # at the end this compares the checksum
-            size = stream.tell()
-    except (zlib.error, EOFError, gzip.BadGzipFile) as error:
-        raise ValueError(f"{path} cannot be decompressed ({error}); copy or export it again.") from error
-    with path.open("rb") as raw:
-        raw.seek(-4, os.SEEK_END)
-        if more or raw.read() != struct.pack("<I", size & 0xFFFFFFFF):  # zeros may follow
-            raise _longer(path, head)
-    return head, np.split(np.frombuffer(body, dtype=np.uint8), np.cumsum(sizes)[:-1]), extensions
-
-
-def _streams(path: Path, data: bytes) -> tuple[tuple[Any, ...], list[np.ndarray], bytes]:
-    """The header, the parts and the extensions of a file of version 4."""
-    head, sizes = _sizes(path, data)
-    if head[1] != 4:
-        raise ValueError(f"{path} has `version` {head[1]}, but is not compressed by gzip; copy or export it again.")
-    zstandard = _zstandard(path)
-    wanted = [size for size in sizes if size]
-    if len(data) < _TABLE:
-        raise _truncated(path, _TABLE, len(data))
-    table = struct.unpack_from("<I", data, _HEAD.size)[0]
-    start = table + 16 * len(wanted)
-    misplaced = table < _TABLE if head[5] & _EXTENDED else table != _TABLE
-    if head[6] != len(wanted) or misplaced or start > len(data):
-        raise ValueError(f"{path} has a broken table of {head[6]} streams at byte {table}; copy or export it again.")
-    parts = []
-    for index, size in enumerate(wanted):
-        length, announced = struct.unpack_from("<QQ", data, table + 16 * index)
-        if announced != size or start + length > len(data):
-            raise ValueError(f"{path}: stream {index} does not fit its table; copy or export it again.")
-        packed = data[start : start + length]
-        try:
-            if zstandard.frame_content_size(packed) not in (-1, size):
-                raise _longer(path, head)
-            part = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size, allow_extra_data=False)
-        except zstandard.ZstdError as error:
-            raise ValueError(f"{path}: stream {index} cannot be decompressed ({error}); export it again.") from error
-        if len(part) < size:
-            raise _truncated(path, size, len(part))
-        parts.append(np.frombuffer(part, dtype=np.uint8))
-        start += length
-    if start < len(data):
-        raise _longer(path, head)
-    return head, [*parts, *([np.empty(0, dtype=np.uint8)] * (len(sizes) - len(parts)))], data[_TABLE:table]
+def _other_size(head: tuple[Any, ...], needed: int, found: str) -> ValueError:
+    what = "`version` {}, `count` {:,}, `degree` {}".format(*head[1:4])
+    return ValueError(f"its header announces {needed:,} bytes ({what}), but {found}")
 
 
 def _check_axes(path: Path, extensions: bytes) -> None:
-    """Raise ValueError if the axes are left-handed, which would mirror the scene, or an extension is cut off."""
-    left = memoryview(extensions)
-    while left:
-        kind, length = struct.unpack_from("<II", left) if len(left) >= 8 else (0, len(left))
-        if 8 + length > len(left):
-            raise ValueError(
-                f"{path}: extension {kind:#x} announces a `length` of {length:,} bytes, but {max(len(left) - 8, 0):,} "
-                "follow; copy or export it again."
-            )
-        axes = int.from_bytes(left[8:12], "little")
+    """Raise ValueError if the axes are left-handed, which would mirror the scene."""
+    while extensions:
+        kind, length = struct.unpack_from("<II", extensions)
+        axes = int.from_bytes(extensions[8:12], "little")
         if kind == _AXES and 0 < axes <= 16 and ((axes - 1 & 7) ^ 3).bit_count() % 2:  # 4 stands for right, up, back
             raise ValueError(f"{path} has left-handed axes (number {axes}); export it with others, such as RUB.")
-        left = left[8 + length :]
-
-
-def _longer(path: Path, head: tuple[Any, ...]) -> ValueError:
-    return ValueError(
-        f"{path} goes on behind what its header announces (`version` {head[1]}, `count` {head[2]:,}, `degree` "
-        f"{head[3]}); copy or export it again."
-    )
-
-
-def _truncated(path: Path, needed: int, found: int) -> ValueError:
-    return ValueError(
-        f"{path} is truncated: `count` asks for {needed:,} bytes, but {found:,} follow; copy or export it again."
-    )
+        extensions = extensions[8 + length :]
 
 
 def _zstandard(path: Path | None = None) -> Any:
@@ -257,10 +205,6 @@ def _coarse(values: np.ndarray, bits: int) -> np.ndarray:
     """Harmonics (N, K, 3) from -1 to 1 as bytes that are multiples of 2^(8 - bits), with 0 at 128."""
     step = 1 << (8 - bits)
     return np.clip(np.floor((np.rint(values * 128) + 128 + step // 2) / step) * step, 0, 255).astype(np.uint8)
-
-
-def _half(raw: np.ndarray) -> np.ndarray:
-    return raw.view("<f2").reshape(-1, 3).astype(np.float32)
 
 
 def _fixed(raw: np.ndarray, fraction: int) -> np.ndarray:

@@ -499,10 +499,7 @@ def updated_load(
     order, position, velocity, affine, F_elastic, F_total, lost, internal, constants, moving, count,
     PLASTIC: tl.constexpr, INTERNAL: tl.constexpr, VALUES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """``updated``:
-
-    Copy particle fields, and the other rows ``constants`` (P, 5 + VALUES), to the rows of ``moving``.
-    """
+    """``updated``: copy particle fields and ``constants`` (P, 5 + VALUES) to the rows of ``moving``."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = index < count
     where = tl.load(order + index, mask, 0)

@@ -553,19 +553,16 @@ class Normalisation:
         scene: Scene,
         material: Material,
         solver: Solver,
-        camera: CameraPath | None = None,
-        cameras: Mapping[str, CameraPath] | None = None,
         edits: Sequence[Edit] = (),
         cloud: GaussianCloud | None = None,
-    ) -> tuple[Scene, Material, Solver, CameraPath | None, dict[str, CameraPath], list[Edit]]:
+    ) -> tuple[Scene, Material, Solver, list[Edit]]:
         """Components in scene units, from those in the normalised space, which stay as they are.
 
         Args:
-            camera: Converted by ``CameraPath.in_space``; most cameras are in scene units.
             cloud: The Gaussians of the scene, if they have been read already.
 
         Returns:
-            Copies of the first six arguments, the scene with ``metres_per_unit`` set.
+            Copies of the first four arguments, the scene with ``metres_per_unit`` set.
         """
         if scene.longest_side is not None or scene.metres_per_unit is not None:
             raise ValueError(
@@ -580,10 +577,9 @@ class Normalisation:
         regions = [dataclasses.replace(e, region=RegionInFrame(e.region, frame)) for e in material.regions]
         conditions = [b.in_frame(frame) for b in solver.boundaries if isinstance(b, Boundary)]
         solver = changed(solver, boundaries=FixedList(conditions))
-        material, first = dataclasses.replace(material, regions=regions), camera and camera.in_space(frame)
-        further = {name: path.in_space(frame) for name, path in (cameras or {}).items()}
+        material = dataclasses.replace(material, regions=regions)
         changes = [dataclasses.replace(e, region=e.region and RegionInFrame(e.region, frame)) for e in edits]
-        return scene, material, solver, first, further, changes
+        return scene, material, solver, changes
 
 
 if TYPE_CHECKING:

@@ -221,8 +221,7 @@ class Simulation(Fixed):
         if normalisation is not None:
             if hold is not None:
                 raise ValueError("`hold` cannot be combined with `normalisation`: give a solver with the pins.")
-            parts = settings, material, solver, camera, cameras, edits
-            settings, material, solver, camera, cameras, edits = normalisation.place(*parts, cloud)
+            settings, material, solver, edits = normalisation.place(settings, material, solver, edits, cloud)
         material, solver = with_parts(settings, cloud, material, solver)
         apart = [
             part.region for part in (*solver.boundaries, *edits) if isinstance(getattr(part, "region", None), Region)

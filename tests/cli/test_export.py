@@ -39,9 +39,9 @@ def test_usd_as_given(flag, tmp_path, capsys):
     [
         (["a.usdc", "--up", "0", "0", "0"], "zero"),
         (["a.usdc", "--metres-per-unit", "-1"], "`--metres-per-unit` to be positive"),
-        (["a.splat", "--up", "0", "0", "1"], "--up and --metres-per-unit are only for USD and glTF"),
-        (["a.splat", "--spz-version=4"], "--spz-version is only for .spz files: leave it out"),
-        (["a.splat", "--apart"], "--apart is only for the frames of a run"),
+        (["a.splat", "--up", "0", "0", "1"], "--up is not for a splat as .splat: leave it out"),
+        (["a.splat", "--spz-version=4"], "--spz-version is not for a splat as .splat"),
+        (["a.splat", "--apart"], "--apart is not for a splat"),
         (["--web", "--spz-version=4"], "--spz-version is not for a film"),
     ],
 )

@@ -35,8 +35,7 @@ FORMATS = {
         "means": math.log(4) / 65535 * 4, "scales": 2 / 255, "opacities": 0.501 / 255, "colors": 0.8 / 255,
         "sh": 0.8 / 255, "quats": 2 * 2 * 0.5 * 2**0.5 / 255 * 3**0.5,
     },
-    # centres are half floats, or have 24 bits, of numbers up to 3; w follows from bytes of x, y, z, however small it is
-    "1.spz": SPZ | {"means": 2.0**-10, "quats": 0.2},
+    # centres have 24 bits, of numbers up to 3; w follows from bytes of x, y, z, however small it is
     "2.spz": SPZ | {"means": 2.0**-21, "quats": 0.2},
     "3.spz": SPZ | {"means": 2.0**-21, "quats": SMALLEST_THREE},
     "4.spz": SPZ | {"means": 2.0**-21, "quats": SMALLEST_THREE},
@@ -66,7 +65,7 @@ def test_round_trip(kind, degree, tmp_path):
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-@pytest.mark.parametrize("kind", ["1.spz", "4.spz", "sog", "glb"])
+@pytest.mark.parametrize("kind", ["3.spz", "4.spz", "sog", "glb"])
 def test_reading_takes_no_more_memory_than_is_reckoned(kind, degree, tmp_path):
     if kind == "4.spz":
         pytest.importorskip("zstandard")

@@ -70,12 +70,10 @@ def test_far_away_and_tiny(tmp_path):
     found = read_gaussians(tmp_path / "a.spz")
     near(found.means, cloud.means, 2.0**-7)
     assert found.scales[5].tolist() == [-10.0] * 3
-    with value_error(r"centres up to ±8e6 .* one is at 100000: remove"):
-        export_cloud(tmp_path / "b.spz", cloud, spz_version=1)
     cloud.means[3, 1] = 1e7
-    with value_error(r"one is at 1e[+]07"):
+    with value_error(r"centres up to ±8e6, but one is at 1e[+]07: remove"):
         export_cloud(tmp_path / "b.spz", cloud)
-    with value_error("`spz_version` to be 1, 2, 3 or 4, but got 5"):
+    with value_error("`spz_version` to be 2, 3 or 4, but got 5"):
         export_cloud(tmp_path / "b.spz", cloud, spz_version=5)
     assert [path.name for path in tmp_path.iterdir()] == ["a.spz"]
 
@@ -95,9 +93,6 @@ def test_flags_and_extensions_are_told(tmp_path):
     path = tmp_path / "a.spz"
     path.write_bytes(gzip.compress(_body(_put(14, "B", 1))))
     with user_warning("trained with antialiasing"):
-        read_gaussians(path)
-    path.write_bytes(gzip.compress(_body(_put(14, "B", 0x84))))
-    with user_warning("ignored the unknown `flags` 0x84"):
         read_gaussians(path)
     axes = struct.Struct("<IIIIII")  # an extension that is not known, and that of the axes
     for number, good in (
@@ -125,9 +120,8 @@ def test_flags_and_extensions_are_told(tmp_path):
     far = struct.pack("<II5000xIII", 7, 5000, 0xADBE0003, 4, 8)
     path.write_bytes(gzip.compress(_body(_put(14, "B", 2)) + far))
     refused(path, "left-handed")
-    for cut, words in ((-1, "0xadbe0003 announces a `length` of 4 bytes, but 3 follow"), (-9, "but 0 follow")):
-        path.write_bytes(gzip.compress(_body(_put(14, "B", 2)) + far[:cut]))
-        refused(path, words)
+    path.write_bytes(gzip.compress(_body(_put(14, "B", 2)) + far[:-9]))
+    refused(path, "is not a usable .spz file")
 
 
 def test_harmonics_of_degree_4(tmp_path):
@@ -147,34 +141,31 @@ def test_bad_files(tmp_path):
     path = tmp_path / "bad.spz"
     good, behind = (
         gzip.compress(_body(degree=1)),
-        "goes on behind what its header announces (`version` {}, `count` {}, ",
+        "bytes (`version` {}, `count` {}, ",
     )
     for data, message in (
         (gzip.compress(_body(_put(8, "<I", 1))), behind.format(3, 1)),
         (gzip.compress(_body(_put(12, "B", 0), degree=1)), behind.format(3, 2)),
         (gzip.compress(_body(_put(4, "<I", 2))), behind.format(2, 2)),
-        (gzip.compress(_body(_put(4, "<I", 4))), "has `version` 4, but is compressed by gzip"),
-        (_body(_put(4, "<I", 3), version=4), "has `version` 3, but is not compressed by gzip"),
-        (gzip.compress(_body(_put(13, "B", 25))), "24 bits with `fractional_bits` 25"),
+        (gzip.compress(_body(_put(4, "<I", 4))), "`version` 4 is not compressed by gzip"),
+        (_body(_put(4, "<I", 3), version=4), "`version` 1 to 3 is compressed by gzip"),
+        (gzip.compress(_body(_put(13, "B", 25))), "`fractional_bits` 25"),
         (good[:-8], "ended before the end-of-stream marker"),
         (good[:-3], "ended before the end-of-stream marker"),
         (good[:-8] + bytes(8), "CRC check failed"),
-        (good + b"more", "cannot be decompressed (Not a gzipped file"),
-        (good + bytes(3), behind.format(3, 2)),
-        (good + gzip.compress(b""), behind.format(3, 2)),
+        (good + b"more", "Not a gzipped file"),
         (_body(version=4) + b"\0", behind.format(4, 2)),
-        (_body(_put(16, "<I", 40), version=4), "broken table of 5 streams at byte 40"),
-        (_body(version=4)[:37], "broken table of 5 streams at byte 32"),
+        (_body(_put(16, "<I", 40), version=4), "is not a usable .spz file"),
+        (_body(version=4)[:37], "is not a usable .spz file"),
         (b"#\n", "starts neither as gzip nor with `NGSP`"),
-        (b"\x1f\x8b" + bytes(40), "cannot be decompressed"),
-        (gzip.compress(_body()[:-3]), "`count` asks for 40 bytes, but 37 follow"),
-        (gzip.compress(_body(_put(4, "<I", 9))), "not an .spz file of `version` 1 to 4"),
+        (b"\x1f\x8b" + bytes(40), "Unknown compression method"),
+        (gzip.compress(_body()[:-3]), "announces 40 bytes (`version` 3, `count` 2, `degree` 0), but 37 bytes"),
+        (gzip.compress(_body(_put(4, "<I", 9))), "`version` 9"),
         (gzip.compress(_body(_put(8, "<I", 0))), "zero Gaussians"),
         (gzip.compress(_body(_put(8, "<I", 2**32 - 1))), "announces a `count` of 4,294,967,295 Gaussians, far more"),
-        (gzip.compress(_body(_put(8, "<I", 100_000))), "`count` asks for 2,000,000 bytes, but"),
-        (gzip.compress(_body(_put(12, "B", 5))), "harmonics of degree 5, but they end at 4"),
-        (_body(_put(15, "B", 6), version=4), "broken table of 6 streams"),
-        (_body(_put(32, "<Q", 2**63), version=4), "stream 0 does not fit its table"),
+        (gzip.compress(_body(_put(8, "<I", 100_000))), "announces 2,000,000 bytes"),
+        (gzip.compress(_body(_put(12, "B", 5))), "harmonics of degree 5"),
+        (_body(_put(32, "<Q", 2**63), version=4), "is not a usable .spz file"),
     ):
         path.write_bytes(data)
         refused(path, message)
@@ -190,7 +181,7 @@ def test_no_more_is_decompressed_than_announced(tmp_path):
     (tmp_path / "b.spz").write_bytes(longer[:112] + bomb + longer[112 + old :])
     for name in ("a.spz", "b.spz"):
         tracemalloc.start()
-        refused(tmp_path / name, "goes on behind")
+        refused(tmp_path / name, "its header announces")
         assert tracemalloc.get_traced_memory()[1] < 1 << 22
         tracemalloc.stop()
 
@@ -218,12 +209,7 @@ def test_few_bytes_cannot_take_much_memory(count, spare, tmp_path):
 
 
 def test_values_that_cannot_be_used(tmp_path):
-    """Half precision of version 1 can hold what is not a number; an opacity of 1 ends half a step below."""
-    data = bytearray(gzip.decompress(encode_spz(varied_cloud(20, degree=0), 1)))
-    data[16:18] = np.float16([np.nan]).tobytes()
-    (tmp_path / "a.spz").write_bytes(gzip.compress(bytes(data)))
-    with user_warning("left out 1 of 20"):
-        assert len(read_gaussians(tmp_path / "a.spz")) == 19
+    """An opacity of 1 ends half a step below."""
     cloud = varied_cloud(20)
     cloud.opacities[5] = math.inf
     export_cloud(tmp_path / "b.spz", cloud)

@@ -128,8 +128,8 @@ def test_what_never_moves_is_written_once(recorded, tmp_path):
     ("options", "words"),
     [
         (["f.ply"], "need a file each: give a target with # for their numbers, such as frame_####.ply, or one that"),
-        (["f_#.glb", "--up", "0", "1", "0"], "--up is not for a run"),
-        (["f_#.ply", "--spz-version", "3"], "--spz-version is only for .spz files"),
+        (["f_#.glb", "--up", "0", "1", "0"], "--up is not for the frames of a run"),
+        (["f_#.ply", "--spz-version", "3"], "--spz-version is not for the frames of a run as .ply"),
         (["f_#.obj"], "Cannot tell the format of"),
     ],
 )

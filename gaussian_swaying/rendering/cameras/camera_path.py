@@ -11,7 +11,6 @@ from torch import Tensor
 
 from gaussian_swaying._checks import check_positive, check_vector
 from gaussian_swaying._fixed import Fixed
-from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.origin import NO_ORIGIN, Origin
 from gaussian_swaying.rendering.cameras.camera import (
     Camera,
@@ -45,10 +44,6 @@ class CameraPath(Fixed, ABC):
         path = replace(self)  # type: ignore[type-var]
         path._origin = origin
         return path
-
-    def in_space(self, frame: SimFrame) -> CameraPath:
-        """The path converted from another space to scene units, by that space's frame."""
-        return self
 
     @abstractmethod
     def __call__(self, frame: int, time: float, center: Tensor, up: Tensor, size: float) -> Camera:
