@@ -74,9 +74,6 @@ def openness(
     not differentiable. The lines are fixed, so a rotation changes the sum by about a percent.
 
     Args:
-        means: Centres [scene units], shape (N, 3).
-        normals: Unit normals, of either sign, shape (N, 3).
-        log_scales: Logarithm of the standard deviations [scene units], shape (N, 3).
         areas: Areas without shadow, above zero [scene units^2], shape (N,).
         opacity: Opacities from 0 to 1, shape (N,); None if all are opaque.
 

@@ -292,7 +292,6 @@ def on_material(place: Tensor, nearest: Tensor, points: MaterialPoints, dx: floa
     Args:
         place: Rest positions [m], shape (M, 3), float64.
         nearest: A material point close to each, shape (M,); with ``attached`` parts, one of the part that it follows.
-        dx: Grid spacing [m].
 
     Returns:
         The places, shape (M, 3), and the nodes of each, shape (27, M), or None if they are those of the lattice.

@@ -486,7 +486,6 @@ class SiteForces:
 
         Args:
             time: Time at which the first one acts [s], scalar float64 tensor.
-            dt: Substep [s].
         """
         values = self.loads.take(forces, steps)
         if values is not None:

@@ -149,7 +149,6 @@ class Run(ABC):
         """Advance by ``steps`` substeps of ``dt`` [s], with forces or with one constant force (see ``MPMSolver.step``).
 
         Args:
-            dt: Substep [s].
             force: Force [N], shape (..., P, 3), or None; only without ``forces``.
             drag: Its resistance [kg/s], shape (..., P), or None.
             looks: Numbers of the substeps after which the wave speed is measured, if ``watches``.

@@ -67,10 +67,6 @@ def flattened(F, n, mu, lam):
     The sheet has the unit normal m, along cof(F) n, and the area ratio a, its length. The thickness ratio h has no
     stress across the sheet for fixed corotated elasticity, :math:`h = (2 \mu + \lambda a) / (2 \mu + \lambda a^2)`, and
     to first order for other laws.
-
-    Args:
-        mu: Shear modulus [Pa].
-        lam: First Lamé parameter [Pa].
     """
     turned = matvec(cofactor(F), n)
     area = tl.sqrt(tl.maximum(dot3(turned, turned), _LEAST * _LEAST))
@@ -217,7 +213,6 @@ def bending_of(points: MaterialPoints, stencil: Stencil, dx: float, softened: Te
     """The bending of the sheets of a material; None if it has none.
 
     Args:
-        dx: Grid spacing [m].
         softened: Factor of the stiffness of each point, shape (..., P); None for one.
     """
     if points.bending is None or points.normal is None:
@@ -250,7 +245,6 @@ def second_derivatives(fraction: Tensor, normal: Tensor, dx: float) -> Tensor:
     Args:
         fraction: Place in cells from the first of the three nodes of each axis, shape (K, 3).
         normal: Unit normals, shape (K, 3).
-        dx: Grid spacing [m].
 
     Returns:
         Along the first direction twice, the second one twice, and both, shape (K, 3, 27).

@@ -614,11 +614,7 @@ class MPMSolver(Fixed, Solver):
 
 
 def _check_begin(bound: Formulation, state: MPMState, dt: float, steps: int, limit: bool = True) -> int:
-    """Check the arguments of a rollout.
-
-    Args:
-        dt: Substep [s].
-    """
+    """Check the arguments of a rollout."""
     _check_state(bound, state)
     if isinstance(dt, bool) or not isinstance(dt, Real):
         raise TypeError(f"Expected `dt` to be a number of seconds, but got {type(dt).__name__}.")
@@ -692,7 +688,6 @@ def _check_end(
     """Raise an error if the state after a rollout is not valid (one GPU synchronisation).
 
     Args:
-        dt: Substep [s].
         forces: The forces that acted; called once more, for the first substep, if something is NaN.
     """
     check_pace(dt, bound.obstacle_cells(before, steps * dt), "dt")

@@ -85,7 +85,6 @@ def bounding_grid(low: Tensor, high: Tensor, dx: float, margin: int) -> GridSpec
     Args:
         low: Smallest coordinates of the points [m], shape (3,).
         high: Largest coordinates of the points [m], shape (3,).
-        dx: Grid spacing [m].
     """
     # Python integers, which do not overflow
     first = [math.floor(x) - margin for x in (low / dx - 0.5).tolist()]

@@ -567,7 +567,6 @@ def crowd_of(position: Tensor, dx: float) -> float:
 
     Args:
         position: Rest positions [m], shape (..., P, 3).
-        dx: Grid spacing [m].
     """
     flat = position.reshape(-1, *position.shape[-2:])[0]
     sizes = torch.unique(torch.floor(flat / dx - 0.5).int(), dim=0, return_counts=True)[1].double()

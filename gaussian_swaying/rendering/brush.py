@@ -41,7 +41,6 @@ def seen(means: Tensor, covariances: Tensor, camera: Camera, picture: RenderOutp
     nothing.
 
     Args:
-        means: Centres [scene units], shape (N, 3).
         covariances: Their covariances [scene units²], shape (N, 3, 3).
         picture: A picture of them from there, which may have fewer pixels.
         slack: See there [scene units].

@@ -148,11 +148,6 @@ def render_gsplat(
 
     Args:
         means: Centres [scene units], on a CUDA device, shape (N, 3).
-        covariances: Symmetric covariances [scene units^2], shape (N, 3, 3).
-        opacities: Opacities in [0, 1], shape (N,).
-        colors: Colours as displayed, shape (N, 3).
-        background: Colour behind the Gaussians, shape (3,); black when None.
-        eps2d: Added to the diagonal of the projected covariances [pixels^2].
 
     Returns:
         The picture, in the precision of ``means``.
@@ -212,12 +207,8 @@ def rasterize_splat(
 
     Args:
         means: Centres [scene units], float32 on a CUDA device, shape (N, 3).
-        quats: Quaternions (w, x, y, z) of any length, shape (N, 4).
         scales: Standard deviations [scene units], shape (N, 3).
-        opacities: Opacities in [0, 1], shape (N,).
         sh: Coefficients of real spherical harmonics, shape (N, K, 3).
-        background: Colour behind the Gaussians, shape (3,); black when None.
-        eps2d: Added to the diagonal of the projected covariances [pixels^2].
         channels: Further values to blend behind the colours, over zero, shape (N, E).
 
     Returns:

@@ -60,12 +60,6 @@ def render(
     The same bits for any number of threads.
 
     Args:
-        means: Centres [scene units], shape (N, 3).
-        covariances: Symmetric covariances [scene units^2], shape (N, 3, 3).
-        opacities: Opacities in [0, 1], shape (N,).
-        colors: Colours as displayed, shape (N, 3).
-        background: Colour behind the Gaussians, shape (3,); black when None.
-        eps2d: Added to the diagonal of the projected covariances [pixels^2].
         detail: Size below which Gaussians are thinned [pixels]; 0 for none.
 
     Returns:

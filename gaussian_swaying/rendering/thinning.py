@@ -41,12 +41,8 @@ def thinned(
     and its opacity o becomes :math:`1 - (1 - o)^{1 / (q g)}`: the optical depth, times the area, is that of all.
 
     Args:
-        means: Centres [scene units], shape (N, 3).
-        covariances: Symmetric covariances [scene units^2], shape (N, 3, 3).
-        opacities: Opacities in [0, 1], shape (N,).
         colors: Colours, shape (N, 3).
         detail: The size d [pixels].
-        eps2d: Added to the diagonal of the projected covariances [pixels^2].
 
     Returns:
         Centres, covariances, opacities and colours of the M Gaussians to be drawn.

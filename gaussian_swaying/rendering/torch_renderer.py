@@ -68,12 +68,6 @@ def project_gaussians(
     1/255, or if the ellipse where its alpha reaches 1/255 is outside the image. That ellipse has
     :math:`\sqrt{2 \ln(255\,o)} \le 3.33` standard deviations (Radl et al. 2024, arXiv 2402.00525, appendix B.2).
 
-    Args:
-        means: Centres [scene units], shape (N, 3).
-        covariances: Symmetric covariances [scene units^2], shape (N, 3, 3).
-        opacities: Opacities in [0, 1], shape (N,).
-        eps2d: Added to the diagonal of the projected covariances [pixels^2].
-
     Returns:
         The V remaining Gaussians, sorted by depth; Gaussians of equal depth keep their order.
     """
@@ -198,8 +192,6 @@ def composite_gaussians(
 
     Args:
         features: Values to blend, shape (V, D).
-        width: Image width [pixels].
-        height: Image height [pixels].
         max_pairs: Approximate number of pairs of a Gaussian and a pixel in memory at a time (autograd keeps them all).
 
     Returns:
@@ -269,12 +261,6 @@ def render_torch(
     Differentiable with respect to ``means``, ``covariances``, ``opacities``, ``colors`` and ``background``.
 
     Args:
-        means: Centres [scene units], shape (N, 3).
-        covariances: Symmetric covariances [scene units^2], shape (N, 3, 3).
-        opacities: Opacities in [0, 1], shape (N,).
-        colors: Colours as displayed, shape (N, 3).
-        background: Colour behind the Gaussians, shape (3,); black when None.
-        eps2d: Added to the diagonal of the projected covariances [pixels^2].
         max_pairs: Approximate number of pairs of a Gaussian and a pixel in memory at a time.
 
     Returns:

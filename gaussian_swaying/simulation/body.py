@@ -371,8 +371,6 @@ def plate_stiffness(E: Tensor, nu: Tensor, thickness: Tensor) -> Tensor:
     r"""Kirchhoff's stiffness :math:`D = E h^3 / (12 (1 - \nu^2))` of a plate [N m], shape (N,).
 
     Args:
-        E: Young's moduli [Pa], shape (N,).
-        nu: Poisson's ratios, shape (N,).
         thickness: Thicknesses h [m], shape (N,).
     """
     return E * thickness**3 / (12 * (1 - nu.square()))
@@ -386,8 +384,6 @@ def layer_distance(bending: Tensor, E: Tensor, nu: Tensor, thickness: Tensor) ->
 
     Args:
         bending: D [N m], shape (N,).
-        E: Young's moduli [Pa], shape (N,).
-        nu: Poisson's ratios, shape (N,).
         thickness: Thicknesses h [m], shape (N,).
 
     Returns:
@@ -428,8 +424,6 @@ def check_extent(means: Tensor, metres_per_unit: float, dx: float, index: Tensor
 
     Args:
         means: Centres of the simulated Gaussians [scene units], shape (N, 3).
-        metres_per_unit: Length of a scene unit [m].
-        dx: Grid spacing [m].
         index: Indices of the Gaussians in the splat, for the message, shape (N,).
     """
     if len(means) < _FEW:
@@ -463,7 +457,6 @@ def coarse(side: float, dx: float) -> list[str]:
 
     Args:
         side: Longest side of the object [m].
-        dx: Grid spacing [m].
     """
     if not SHORT * dx <= side < COARSE * dx:  # shorter ones are warned of at the start
         return []
@@ -475,7 +468,6 @@ def narrow(points: Tensor, dx: float, moved: float) -> list[str]:
 
     Args:
         points: Rest positions of the points of a body that is not filled [m], shape (P, 3).
-        dx: Grid spacing [m].
     """
     if len(points) < _FEW or not moved > BENT:
         return []
@@ -504,8 +496,6 @@ def check_density(means: Tensor, metres_per_unit: float, dx: float) -> None:
 
     Args:
         means: Centres of the simulated Gaussians [scene units], shape (N, 3).
-        metres_per_unit: Length of a scene unit [m].
-        dx: Grid spacing [m].
 
     Warns:
         UserWarning: If half of them are farther than three quarters of a cell from the nearest other one.
@@ -573,7 +563,6 @@ def pieces_in_cells(position: Tensor, dx: float, pairs: Tensor) -> Tensor:
 
     Args:
         position: Rest positions [m] in the precision of the solver, shape (N, 3).
-        dx: Grid spacing [m].
         pairs: Pairs of samples that are attached, shape (E, 2).
     """
     a, b = torch.floor(position / dx - 0.5)[pairs].unbind(1)
@@ -586,7 +575,6 @@ def lies_apart(position: Tensor, dx: float, pairs: Tensor) -> bool:
 
     Args:
         position: Rest positions [m] in the precision of the solver, shape (N, 3).
-        dx: Grid spacing [m].
         pairs: Pairs of samples that are attached, shape (E, 2).
     """
     grid = bounding_grid(position.amin(0), position.amax(0), dx, margin=0)
@@ -601,7 +589,6 @@ def homes(position: Tensor, dx: float, pairs: Tensor, piece: Tensor) -> tuple[Te
 
     Args:
         position: Rest positions [m], shape (N, 3).
-        dx: Grid spacing [m].
         pairs: Pairs of samples that are attached, shape (E, 2).
         piece: From :func:`pieces_in_cells`, shape (N,).
 
@@ -668,7 +655,6 @@ def joints_of(
         owner: The material point that each belongs to, shape (N,).
         position: Rest positions of the material points [m]; of a sheet of three layers those of the layers one after
             the other, shape (P, 3).
-        dx: Grid spacing [m].
     """
     names, found = [part.name for part in parts.parts], []
     first_layer = int(owner.max()) + 1
@@ -903,7 +889,6 @@ def cell_volume(position: Tensor, dx: float) -> Tensor:
 
     Args:
         position: Rest position [m], shape (P, 3).
-        dx: Grid spacing [m].
 
     Returns:
         Volume [m³], shape (P,).
@@ -930,7 +915,6 @@ def grouped(
     pieces, or the two sides of the border of a region in ``apart``.
 
     Args:
-        dx: Grid spacing [m].
         piece: A number for each sample, the same for those that are attached in their cell, shape (N,); None if all
             are.
         home: The places by which they are grouped [m], shape (N, 3), if these are not their own.
@@ -1095,7 +1079,6 @@ def surface_of(samples: Samples, owner: Tensor, points: MaterialPoints, dx: floa
 
     Args:
         owner: A material point close to each, shape (N,).
-        dx: Grid spacing [m].
         contact: Contact of the surface with itself; None if only obstacles count.
     """
     chosen = (samples.surface & (samples.body_area > 0)).nonzero()[:, 0]

@@ -293,7 +293,6 @@ def why_apart(scene: SimulatedScene, dx: float, held: Tensor) -> str | None:
     what does not would fall, though a grid may hold it.
 
     Args:
-        dx: Grid spacing [m].
         held: Which Gaussians are held, bool, shape (N,).
     """
     assert scene.pairs is not None

@@ -40,10 +40,8 @@ def anisotropy_loss(log_scales: Tensor, a: float = 1.1, ratio: str = "paper", re
     r"""Penalty on elongated Gaussians, :math:`\max(S^1 / S^2 - a, 0)` (Gaussian Swaying, "Training").
 
     Args:
-        log_scales: Logarithm of the standard deviations [scene units], shape (N, 3).
         ratio: ``paper`` divides the largest by the second largest scale, so that discs are free; ``max_min`` (Xie et
             al. 2024, "PhysGaussian") divides the largest by the smallest, which asks for balls.
-        reduction: ``mean`` or ``sum`` over the Gaussians.
 
     Returns:
         A number, 0 without Gaussians.
@@ -66,7 +64,6 @@ def opacity_entropy_loss(opacities: Tensor, reduction: str = "mean") -> Tensor:
 
     Args:
         opacities: Opacities from 0 to 1, shape (N,); values below 1e-7 count as that, where the gradient is zero.
-        reduction: ``mean`` or ``sum`` over the Gaussians.
 
     Returns:
         A number, 0 without Gaussians.
@@ -79,9 +76,7 @@ def size_loss(log_scales: Tensor, b: float = 0.008, reduction: str = "mean") -> 
     r"""Penalty on large Gaussians, :math:`\max(S^1 - b, 0)` of the largest scale (Gaussian Swaying, "Training").
 
     Args:
-        log_scales: Logarithm of the standard deviations [scene units], shape (N, 3).
         b: Scale from which on a Gaussian counts as large [scene units].
-        reduction: ``mean`` or ``sum`` over the Gaussians.
 
     Returns:
         A number [scene units], 0 without Gaussians.

@@ -215,7 +215,6 @@ def resolution(settings: ComputedAir, wind: WindField, frame_dt: float, position
     """Cost of a box, and the Reynolds number that it resolves.
 
     Args:
-        frame_dt: Length of a frame [s].
         position: Points of the body at rest [m], shape (P, 3).
     """
     speed, length = speed_of(settings, wind), float((position.amax(0) - position.amin(0)).amax())
