@@ -118,6 +118,35 @@ def strip(names: Names, axes: Any) -> None:
     axes.legend(frameon=False, loc="lower right")
 
 
+def skeleton(names: Names, axes: Any) -> None:
+    """The stem from its side with its joints, at rest and bent."""
+    axes.plot(*names["means"].T[[0, 2]], ".", markersize=2, color="0.75", label="at rest")
+    axes.plot(*names["moved"].means.T[[0, 2]], ".", markersize=2, color="tab:green", label="bent")
+    axes.plot(
+        *torch.cat([names["joints"][:1], names["bones"].cumsum(0)]).T[[0, 2]], "k.-", linewidth=0.7, label="joints"
+    )
+    axes.set(aspect="equal", xlabel="x [m]", ylabel="z [m]", xlim=(-0.3, 1.3))
+    axes.legend(frameon=False)
+
+
+def blender_mesh(names: Names, axes: Any) -> None:
+    """The Gaussians from above with the vertices of the mesh, in two frames."""
+    for frame, color in ((12, "tab:orange"), (23, "tab:blue")):
+        axes.plot(*names["places"][frame].T[:2], "o", markersize=4, color="0.85")
+        axes.plot(*names["moved"][frame].means.T[:2], ".", markersize=1, color=color, label=f"frame {frame + 1}")
+    axes.set(xlabel="x [m]", ylabel="y [m]", ylim=(-0.1, 0.03), title="from above; vertices in grey")
+    axes.legend(frameon=False, markerscale=5, ncols=2)
+
+
+def newton_cloth(names: Names, axes: Any) -> None:
+    """Both flags from above, and the flag at rest."""
+    shown = {"at rest": names["skin"].gaussians.means, "Newton": names["moved"], "this package": names["own"]}
+    for (label, means), color in zip(shown.items(), ("0.75", "tab:orange", "tab:blue"), strict=True):
+        axes.plot(*means.cpu().T[:2], ".", markersize=1.5, color=color, label=label)
+    axes.set(xlabel="x [m]", ylabel="y [m]", title="two flags from above, after 0.32 s")
+    axes.legend(frameon=False, markerscale=5)
+
+
 def sand(names: Names, axes: Any) -> None:
     """The heap from its side, before and after."""
     for x, color, label in zip(
@@ -224,15 +253,18 @@ def passes(_: Names) -> Image.Image:
 
 OWN: dict[str, Callable[[Names], Image.Image]] = {
     "behind_a_pole": plotted(air),
+    "blender_mesh": plotted(blender_mesh),
     "custom_force": plotted(vortex),
     "custom_law": plotted(law),
     "film": page("film.html", "!!window.film"),
     "gusts": plotted(gusts),
     "live_page": page("live_page.html", "!!window.windPage"),
     "magnet": plotted(magnet),
+    "newton_cloth": plotted(newton_cloth),
     "own_splat": saved("own_splat.png"),
     "render_passes": passes,
     "sand": plotted(sand),
+    "skeleton": plotted(skeleton),
     "stepping_by_hand": two_winds,
     "sweep_to_dataset": saved("flags/contact_sheet.png"),
     "turbulence": plotted(air),
