@@ -280,9 +280,9 @@ def shown(path: Path) -> Image.Image:
     pictures: list[Image.Image] = []
     write = Frame.save
 
-    def save(frame: Frame, name: str | os.PathLike[str], format: str | None = None) -> None:
-        pictures.append(drawn(frame))
-        write(frame, name, format)
+    def save(self: Frame, path: str | os.PathLike[str], format: str | None = None) -> None:
+        pictures.append(drawn(self))
+        write(self, path, format)
 
     Frame.save, sys.argv = save, [str(path)]  # type: ignore[method-assign]
     sys.path.insert(0, str(path.parent))
