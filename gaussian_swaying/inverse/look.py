@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.inverse.registration import SOLID, Draw, find_camera, grey_of
-from gaussian_swaying.inverse.tracks import ALIKE, alike, follow, opencv
+from gaussian_swaying.inverse.tracks import ALIKE, alike, corners, follow
 from gaussian_swaying.inverse.videos import Footage
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.protocol import RenderOutput
@@ -33,12 +33,12 @@ def shown_in(picture: RenderOutput, frame: Tensor) -> tuple[float, float]:
 
     drawn, real = grey_of(picture.color), grey_of(frame)
     mask = (picture.alpha[..., 0].detach().cpu().numpy() > SOLID).astype(np.uint8)
-    corners = opencv().goodFeaturesToTrack(drawn, 300, 0.01, 5, mask=mask)
-    if corners is None:
+    start = corners(drawn, 300, 0.01, 5, mask)
+    if not len(start):
         return 0.0, math.inf
-    pair = np.stack([drawn, real])[..., None].repeat(3, -1)
-    place, seen = follow(pair, corners.reshape(-1, 2) + 0.5)
-    good = torch.from_numpy(seen[1]) & (alike(torch.from_numpy(pair), torch.from_numpy(place)) > ALIKE)
+    pair = np.stack([drawn, real])
+    place, seen = follow(pair, start)
+    good = torch.from_numpy(seen[1]) & (alike(torch.from_numpy(pair)[..., None], torch.from_numpy(place)) > ALIKE)
     off = torch.from_numpy(place[1] - place[0])[good].norm(dim=-1)
     return float(good.double().mean()), float(off.median()) if len(off) else math.inf
 
