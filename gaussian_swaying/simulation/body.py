@@ -218,7 +218,7 @@ class Scene(Fixed):
 
     @property
     def area_kind(self) -> str:
-        """``area``, or what null stands for."""
+        """``area``, or the default for this scene."""
         if self.area is not None:
             return self.area
         return "open" if self.ply is not None and self.wind_on == "surface" else "coverage"
@@ -231,7 +231,7 @@ class Scene(Fixed):
         return self.generator.generate()
 
     def select(self, cloud: GaussianCloud) -> Tensor:
-        """The Gaussians that are simulated: in the region, opaque enough, and in no part that is still or hidden.
+        """Mask of the simulated Gaussians: in the region, opaque enough, and in no still or hidden part.
 
         Args:
             cloud: All Gaussians.
@@ -387,8 +387,6 @@ def plate_stiffness(E: Tensor, nu: Tensor, thickness: Tensor) -> Tensor:
     r"""Kirchhoff's stiffness :math:`D = E h^3 / (12 (1 - \nu^2))` of a plate [N m], shape (N,).
 
     Args:
-        E: Young's moduli [Pa], shape (N,).
-        nu: Poisson's ratios, shape (N,).
         thickness: Thicknesses h [m], shape (N,).
     """
     return E * thickness**3 / (12 * (1 - nu.square()))
@@ -402,8 +400,6 @@ def layer_distance(bending: Tensor, E: Tensor, nu: Tensor, thickness: Tensor) ->
 
     Args:
         bending: D [N m], shape (N,).
-        E: Young's moduli [Pa], shape (N,).
-        nu: Poisson's ratios, shape (N,).
         thickness: Thicknesses h [m], shape (N,).
 
     Returns:
@@ -444,8 +440,6 @@ def check_extent(means: Tensor, metres_per_unit: float, dx: float, index: Tensor
 
     Args:
         means: Centres of the simulated Gaussians [scene units], shape (N, 3).
-        metres_per_unit: Length of a scene unit [m].
-        dx: Grid spacing [m].
         index: Indices of the Gaussians in the splat, for the message, shape (N,).
     """
     if len(means) < _FEW:
@@ -475,11 +469,10 @@ def check_extent(means: Tensor, metres_per_unit: float, dx: float, index: Tensor
 
 
 def coarse(side: float, dx: float) -> list[str]:
-    """A sentence about the grid of a run if the object has so few cells that a finer grid would move it otherwise.
+    """A warning, as a list, if the object has so few cells that a finer grid would change its motion; else empty.
 
     Args:
         side: Longest side of the object [m].
-        dx: Grid spacing [m].
     """
     if not SHORT * dx <= side < COARSE * dx:  # shorter ones are warned of at the start
         return []
@@ -487,11 +480,10 @@ def coarse(side: float, dx: float) -> list[str]:
 
 
 def narrow(points: Tensor, dx: float, moved: float) -> list[str]:
-    """A sentence about a tube that is bent and has few cells across, so that the grid decides whether it flattens.
+    """A warning, as a list, if a bent tube has so few cells across that the grid decides whether it flattens.
 
     Args:
         points: Rest positions of the points of a body that is not filled [m], shape (P, 3).
-        dx: Grid spacing [m].
     """
     if len(points) < _FEW or not moved > BENT:
         return []
@@ -520,8 +512,6 @@ def check_density(means: Tensor, metres_per_unit: float, dx: float) -> None:
 
     Args:
         means: Centres of the simulated Gaussians [scene units], shape (N, 3).
-        metres_per_unit: Length of a scene unit [m].
-        dx: Grid spacing [m].
 
     Warns:
         UserWarning: If half of them are farther than three quarters of a cell from the nearest other one.
@@ -583,7 +573,7 @@ _BRIDGES = 8  # neighbours to which an extra point on a large Gaussian is attach
 def attached_samples(
     position: Tensor, normal: Tensor, count: int, parts: Parts | None, labels: Tensor | None
 ) -> Tensor:
-    """The pairs of samples of a surface that are attached.
+    """Pairs of attached samples of a surface.
 
     Args:
         position: Rest positions [m], those of the Gaussians first, then extra points, shape (N, 3).
@@ -604,11 +594,10 @@ def attached_samples(
 
 
 def pieces_in_cells(position: Tensor, dx: float, pairs: Tensor) -> Tensor:
-    """A number for each sample, the same for those in one cell that are attached within it.
+    """Labels of samples: equal for those attached to each other within one cell.
 
     Args:
         position: Rest positions [m] in the precision of the solver, shape (N, 3).
-        dx: Grid spacing [m].
         pairs: Pairs of samples that are attached, shape (E, 2).
     """
     a, b = torch.floor(position / dx - 0.5)[pairs].unbind(1)
@@ -617,11 +606,10 @@ def pieces_in_cells(position: Tensor, dx: float, pairs: Tensor) -> Tensor:
 
 @torch.no_grad()
 def lies_apart(position: Tensor, dx: float, pairs: Tensor) -> bool:
-    """True if some node of the grid reaches samples that are not attached to each other there.
+    """True if a grid node reaches samples that are not attached to each other.
 
     Args:
         position: Rest positions [m] in the precision of the solver, shape (N, 3).
-        dx: Grid spacing [m].
         pairs: Pairs of samples that are attached, shape (E, 2).
     """
     grid = bounding_grid(position.amin(0), position.amax(0), dx, margin=0)
@@ -630,13 +618,12 @@ def lies_apart(position: Tensor, dx: float, pairs: Tensor) -> bool:
 
 @torch.no_grad()
 def homes(position: Tensor, dx: float, pairs: Tensor, piece: Tensor) -> tuple[Tensor, Tensor]:
-    """The places at which samples are grouped: a few of a piece beyond the border of a cell, at the next across it.
+    """Places by which samples are grouped; a few that stick out of a cell move to the next across its border.
 
-    They would have copies of nodes of their own, with hardly any mass.
+    Left in their own cell, they would get separate copies of nodes with hardly any mass.
 
     Args:
         position: Rest positions [m], shape (N, 3).
-        dx: Grid spacing [m].
         pairs: Pairs of samples that are attached, shape (E, 2).
         piece: From :func:`pieces_in_cells`, shape (N,).
 
@@ -657,7 +644,7 @@ def homes(position: Tensor, dx: float, pairs: Tensor, piece: Tensor) -> tuple[Te
 
 
 def attached_points(pairs: Tensor, owner: Tensor, parent: Tensor | None, layers: int) -> Tensor:
-    """The pairs of material points that are attached.
+    """Pairs of attached material points.
 
     Args:
         pairs: Pairs of samples, shape (E, 2).
@@ -703,7 +690,6 @@ def joints_of(
         owner: The material point that each belongs to, shape (N,).
         position: Rest positions of the material points [m]; of a sheet of three layers those of the layers one after
             the other, shape (P, 3).
-        dx: Grid spacing [m].
     """
     names, found = [part.name for part in parts.parts], []
     first_layer = int(owner.max()) + 1
@@ -738,16 +724,12 @@ def joints_of(
 def with_parts(
     scene: Scene, cloud: GaussianCloud, material: Material, solver: Solver, field: MaterialField | None = None
 ) -> tuple[Material, Solver]:
-    """Material and solver with what the parts of a scene add to them; both stay as they are if it has none.
+    """Material and solver, extended by the parts of a scene, if it has any.
 
     Args:
-        scene: The scene, all in scene units.
         material: Its ``regions`` come after those of the parts, and win.
         solver: Gets a body for each part that is rigid and for each rigid body of the ``field``, and a pin for all that
             are held, which holds nodes of the grid.
-
-    Returns:
-        Copies.
     """
     parts = scene.parts
     if parts is None and field is None:
@@ -894,8 +876,6 @@ def sample_object(
         normal: Their unit normals, shape (S, 3).
         body_area: Areas that carry material [m²], shape (S,).
         area: Areas that feel the wind [m²], shape (S,).
-        filling: Samples inside a solid, if there are any.
-        frame: Conversion from scene units to metres.
         dx: Grid spacing [m], for ``material.volume = "cell"``.
         field: Numbers that win over those of the whole material, but not over its regions.
     """
@@ -966,7 +946,6 @@ def cell_volume(position: Tensor, dx: float) -> Tensor:
 
     Args:
         position: Rest position [m], shape (P, 3).
-        dx: Grid spacing [m].
 
     Returns:
         Volume [m³], shape (P,).
@@ -987,15 +966,12 @@ def grouped(
     piece: Tensor | None = None,
     home: Tensor | None = None,
 ) -> tuple[Samples, Tensor, Tensor]:
-    """Samples for a grid: for each group one or a few that keep its mass, centre of mass and volume.
+    """Group samples for a grid: a few points per group, with its mass, centre of mass and volume.
 
     A group never mixes kinds of material, laws, the surface and the inside, samples that feel wind and samples that do
     not, pieces, or the two sides of the border of a region in ``apart``.
 
     Args:
-        dx: Grid spacing [m].
-        apart: Regions in scene units: those of pins and edits.
-        frame: Conversion from scene units to metres.
         piece: A number for each sample, the same for those that are attached in their cell, shape (N,); None if all
             are.
         home: The places by which they are grouped [m], shape (N, 3), if these are not their own.
@@ -1038,7 +1014,7 @@ def grouped(
 
 @torch.no_grad()
 def shared_wind(samples: Samples, owner: Tensor, parent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The patches that feel the wind, so that the points of a group share its wind as they share its mass.
+    """Distribute the patches of each group over its points, so that wind is shared as mass is.
 
     A group of up to :data:`SHARED` directions is one patch of each direction at each of its points, with an equal part
     of the area: the wind then has the second moments of the group, too. If each patch went to the point next to it,
@@ -1073,14 +1049,12 @@ def shared_wind(samples: Samples, owner: Tensor, parent: Tensor) -> tuple[Tensor
 
 
 def _parted(group: Tensor, parts: Tensor, which: Tensor) -> tuple[Tensor, Tensor]:
-    """Split some groups (M,) into single samples; return the groups (N,), and which of them are divided (M',)."""
     new = torch.where(which[group], len(parts) + torch.arange(len(group)), group)
     kept, group = torch.unique(new, return_inverse=True)
     return group, torch.cat([parts, torch.zeros(len(new), dtype=torch.bool)])[kept]
 
 
 def _points_of(samples: Samples, group: Tensor, parts: Tensor, side: float) -> tuple[Samples, Tensor, Tensor]:
-    """The points of all groups, the point of each sample, (N,), and the group of each point."""
     mass = samples.mass
     position, owner, of = matched_points(samples.position, mass, group, parts, side)
     count = len(position)
@@ -1162,15 +1136,11 @@ FACING = 0.8
 
 @torch.no_grad()
 def surface_of(samples: Samples, owner: Tensor, points: MaterialPoints, dx: float, contact: Contact | None) -> Surface:
-    """The surface of an object: one of its samples for each part of a cell, with a disc for those that it stands for.
+    """Contact surface of an object: one sample per part of a cell, with a disc that covers those it stands for.
 
     Args:
         owner: A material point close to each, shape (N,).
-        dx: Grid spacing [m].
         contact: Contact of the surface with itself; None if only obstacles count.
-
-    Returns:
-        The surface, in the precision of the points.
     """
     chosen = (samples.surface & (samples.body_area > 0)).nonzero()[:, 0]
     part = samples.choose(chosen)
@@ -1200,7 +1170,7 @@ def surface_of(samples: Samples, owner: Tensor, points: MaterialPoints, dx: floa
 
 @torch.no_grad()
 def close_at_rest(surface: Surface) -> int:
-    """Count pairs of contact samples closer at rest than the thickness, one above the other: they are pushed apart."""
+    """Number of contact pairs closer at rest than the thickness; these are pushed apart."""
     from scipy.spatial import cKDTree
 
     tree = cKDTree(surface.place.double().cpu().numpy())
@@ -1230,7 +1200,7 @@ def warn_close(surface: Surface) -> None:
 def still_distance(
     means: Tensor, covariances: Tensor, opacities: Tensor, low: Tensor, high: Tensor, cells: int, level: float
 ) -> DistanceGrid:
-    """Signed distance from the surface of Gaussians that stand still: where their density passes a level.
+    """Signed distance to the surface of static Gaussians, where their density passes a level.
 
     Args:
         means: Centres [m], shape (N, 3).
@@ -1323,13 +1293,8 @@ def body_of(
 
     Args:
         normals: Their unit normals, shape (N, 3).
-        frame: Conversion from scene units to metres.
         dx: Length that the solver resolves [m].
-        apart: Regions whose borders no group crosses, in scene units.
         labels: The part of each Gaussian, shape (N,), if the scene has parts.
-
-    Returns:
-        The body.
     """
     position = frame.point_to_sim(part.means.double())
     source = torch.arange(len(position))  # the Gaussian of each sample of the surface
@@ -1396,11 +1361,10 @@ def _require_cells_as_large_as(span: Tensor, thickness: Tensor, dx: float) -> No
 def specks_of(
     cloud: GaussianCloud, simulated: Tensor, scene: Scene, frame: SimFrame, dx: float, by_grid: bool
 ) -> Tensor:
-    """The simulated Gaussians that are not connected to the object, if ``scene.loose`` carries them.
+    """Indices of simulated Gaussians not connected to the object, if ``scene.loose`` carries them.
 
     Args:
         simulated: Indices of those that are simulated, shape (N,).
-        frame: Conversion from scene units to metres.
         dx: Length that the solver resolves [m].
 
     Returns:
@@ -1681,7 +1645,7 @@ class SimulatedScene(nn.Module):
 
     @torch.no_grad()
     def still_distance(self, low: Tensor, high: Tensor, cells: int, level: float = 0.5) -> DistanceGrid:
-        """Signed distance from the surface of the Gaussians that stand still, in a box.
+        """Signed distance to the surface of the static Gaussians in a box.
 
         Args:
             low: Lower corner of the box [m], shape (3,).
@@ -1726,9 +1690,6 @@ class SimulatedScene(nn.Module):
             state: State of one scene, fields of shape (P, ·).
             rotations: Whether to compute the rotations; otherwise they are those at rest, which is enough for colours
                 that are the same from every direction.
-
-        Returns:
-            All Gaussians, the static ones at rest.
         """
         rest, index = self.rest(), self.moving
         parts: dict[str, Any] = self.moved(state, rotations)
@@ -1737,7 +1698,7 @@ class SimulatedScene(nn.Module):
         return replace(rest, **parts)
 
     def moved(self, state: State, rotations: bool = True) -> dict[str, Any]:
-        """The Gaussians that move, in the order of ``moving``: the fields that :meth:`deformed` changes, by name."""
+        """Fields of the moving Gaussians that :meth:`deformed` changes, by name, in the order of ``moving``."""
         rest, index = self.rest(), self.moving
         own = rest.means, rest.covariances, rest.normals
         if not self.all_move:
@@ -1774,11 +1735,10 @@ class SimulatedScene(nn.Module):
         return self._kept[1]
 
     def on_gaussians(self, values: Tensor) -> Tensor:
-        """Values of the moving Gaussians (M,) for all of them (N,); the static ones get 0."""
+        """Spread values of the moving Gaussians (M,) to all (N,); static ones get 0."""
         own = values.to(self.model.means.dtype)
         return own.new_zeros(len(self.model.means)).index_copy(0, self.moving, own)
 
 
 def _arm(arm: Tensor, dtype: torch.dtype) -> Tensor | None:
-    """Arms in the precision of the solver; None if all are zero."""
     return arm.to(dtype) if bool(arm.any()) else None
