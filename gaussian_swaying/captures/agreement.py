@@ -18,7 +18,7 @@ _PHOTOS = 8
 
 
 def places_in_picture(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Where a camera sees points, ignoring what hides them.
+    """Project points into a camera, ignoring occlusion.
 
     Args:
         points: Points [scene units], on the CPU, shape (N, 3).
@@ -35,7 +35,7 @@ def places_in_picture(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 def cameras_that_see(points: Tensor, cameras: Sequence[Camera]) -> tuple[int, int]:
-    """How many cameras see any of the points (N, 3): as they are, and with y and z of their axes turned round."""
+    """Number of cameras that see any of the points (N, 3): as given, and with y and z of the camera flipped."""
     some = points[:: -(-len(points) // _SAMPLE)].double()
     turned = [replace(camera, world_to_camera=turned_axes(camera.world_to_camera)) for camera in cameras]
     as_given, other = (sum(bool(places_in_picture(some, c)[1].any()) for c in kind) for kind in (cameras, turned))
@@ -43,14 +43,14 @@ def cameras_that_see(points: Tensor, cameras: Sequence[Camera]) -> tuple[int, in
 
 
 def turned_axes(world_to_camera: Tensor) -> Tensor:
-    """A pose (4, 4) with y and z of the camera turned round: axes of OpenGL in place of those of OpenCV, or back."""
+    """A pose (4, 4) with the camera's y and z flipped: between OpenGL's and OpenCV's axes."""
     return world_to_camera * world_to_camera.new_tensor([1.0, -1.0, -1.0, 1.0])[:, None]
 
 
 def turned_as_points(
     cameras: Sequence[Camera], load: Callable[[int, bool], Tensor], points: Tensor, colors: Tensor
 ) -> bool | None:
-    """Whether photos agree better with the colours of points if they are turned as their EXIF tags say.
+    """Whether rotating the photos by their EXIF tags makes them agree better with the colours of points.
 
     Args:
         load: Reads the photo of an index as it is stored, or turned: dtype uint8, shape (H, W, 3 or 4).

@@ -25,9 +25,6 @@ def patch_area(log_scales: Tensor) -> Tensor:
 
     Overlapping Gaussians are counted several times: see :func:`coverage_area` for areas that add up to the surface.
 
-    Args:
-        log_scales: Logarithm of the standard deviations [scene units], shape (..., 3).
-
     Returns:
         Areas [scene units^2], shape (...).
 
@@ -61,9 +58,6 @@ def coverage_area(
     result is the same on every device; not differentiable.
 
     Args:
-        means: Centres [scene units], shape (N, 3).
-        normals: Unit normals, of either sign, shape (N, 3).
-        log_scales: Logarithm of the standard deviations [scene units], shape (N, 3).
         opacity: Opacities from 0 to 1, shape (N,); None if all are equal.
         neighbours: Nearest centres to consider for each one, at least 6.
 
@@ -138,7 +132,6 @@ def _open_cosine(neighbours: Tensor) -> Tensor:
 def _cells(
     offset: Tensor, distance: Tensor, normal: Tensor, disc: Tensor, discs: Tensor, phase: int
 ) -> tuple[Tensor, Tensor]:
-    """As :func:`_cell_area`, in a kernel where it can be compiled."""
     if not replaces((offset,), torch.float64):
         return _cell_area(offset, distance, normal, disc, discs, phase)
     from gaussian_swaying.gaussians.area_triton import cells

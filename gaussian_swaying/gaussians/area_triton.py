@@ -15,7 +15,6 @@ def _cells(
     K: tl.constexpr, RAYS: tl.constexpr, CLUSTER: tl.constexpr, CELL: tl.constexpr, SLAB: tl.constexpr,
     SPIKE: tl.constexpr, REACH: tl.constexpr, PI: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """One site per lane, the last axis of all tensors; ``flat``, ``reach``, ``cosine`` and ``repeat`` are scratch."""
     lane = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = lane < count
     farthest = tl.load(distance + (K - 1) * count + lane, mask, 1.0)

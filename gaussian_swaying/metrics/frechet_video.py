@@ -222,7 +222,6 @@ class FrechetVideoDistance(Metric):
 
 
 def _joined(features: list[Tensor] | Tensor) -> Tensor:
-    """The features of all batches: a list of them, or one tensor once torchmetrics has gathered them."""
     if isinstance(features, Tensor):
         return features
     return torch.cat(features) if features else torch.zeros(0, 0)

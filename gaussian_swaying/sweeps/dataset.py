@@ -48,9 +48,6 @@ def write_shards(
     Args:
         output: Folder of the files; ``shards`` in the folder of the sweep if None.
 
-    Returns:
-        The files.
-
     Raises:
         ValueError: If the folder is not a sweep, none of its runs is complete, or something was not recorded.
     """
@@ -103,7 +100,6 @@ def write_shards(
 
 
 def _numbers(value: Any) -> list[float]:
-    """The numbers in a value, nested lists flattened; empty if it contains anything else."""
     if isinstance(value, Real):
         return [float(value)]
     parts = [_numbers(item) for item in value] if isinstance(value, list) else []
@@ -130,9 +126,6 @@ def write_contact_sheets(folder: Path, picture: str = "last") -> list[Path]:
 
     Args:
         picture: Frame to show, ``last`` or ``middle``.
-
-    Returns:
-        The files.
     """
     runs = read_record(folder)["runs"]
     files = []
@@ -172,7 +165,6 @@ def _sheet(folder: Path, runs: Mapping[str, Mapping[str, Any]], picture: str) ->
 
 
 def _frame(folder: Path, name: str, picture: str) -> Image | None:
-    """A frame of a run that has ended, small; None if there is none."""
     from PIL import Image
 
     result = read_result(folder, name)

@@ -46,11 +46,7 @@ SUMMARY = (*FIGURES, *(f"{name}_end_J" for name in ENERGIES), "warnings")
 
 
 def open_folder(folder: Path, plan: Plan, resume: bool, together: int = 1) -> FolderLock:
-    """Make and lock the folder of a sweep, or lock the one that is continued.
-
-    Returns:
-        The lock, to be released at the end.
-    """
+    """Make and lock the folder of a sweep, or lock the one that is continued."""
     held = (folder / SWEEP).exists()
     if resume and not held:
         raise ValueError(f"There is nothing to resume in {folder}: it has no {SWEEP}; leave out --resume.")
@@ -157,11 +153,7 @@ def failure(status: str, reason: str, attempt: int) -> dict[str, Any]:
 
 
 def write_tables(folder: Path, plan: Plan, results: Mapping[str, Any], parquet: bool = False) -> None:
-    """Write ``sweep.csv``, a row per run in their order; and ``sweep.parquet`` with numbers and lists as such.
-
-    Args:
-        parquet: Whether to write the second.
-    """
+    """Write ``sweep.csv``, a row per run in their order; and ``sweep.parquet`` with numbers and lists as such."""
     rows = []
     for name, run in zip(plan.names, plan.runs, strict=True):
         result = results.get(name) or {"status": "missing"}

@@ -88,7 +88,6 @@ class Job:
 
     @property
     def wanted(self) -> tuple[str, ...]:
-        """Names of the runs without the complete ones."""
         return tuple(name for name in self.names if name not in self.complete)
 
     def apart(self) -> list[Job]:
@@ -119,7 +118,7 @@ def _parser() -> ArgumentParser:
 
 
 def work(job: Job, threads: int, explain: Explain, where: str = platform.node()) -> Outcome:
-    """Do a job in a worker and write the results of its complete runs; those of failures are not written yet.
+    """Do a job in a worker and write the results of its complete runs; the caller writes those of failures.
 
     Args:
         explain: Makes a sentence of an error; a function of a module.
@@ -153,7 +152,6 @@ def _failed(job: Job, status: str, reason: str, **how: bool) -> Outcome:
 
 
 def _lost(job: Job, reason: str) -> Outcome:
-    """The outcome of a job whose process was killed, maybe after its last step."""
     written = {name: result for name in job.wanted if (result := read_result(job.folder, name)) is not None}
     done = {name: result for name, result in written.items() if result["status"] == "complete"}
     lost = _failed(job, "failed", reason, killed=True, ready=False)
@@ -161,7 +159,6 @@ def _lost(job: Job, reason: str) -> Outcome:
 
 
 def _unlocked(do: Callable[[], Any]) -> Any:
-    """Do what needs a folder, once it is free."""
     begin = time.monotonic()
     while True:
         try:
@@ -173,7 +170,7 @@ def _unlocked(do: Callable[[], Any]) -> Any:
 
 
 def run_alone(job: Job) -> dict[str, dict[str, Any]]:
-    """Do the only run of a job; its summary by its name."""
+    """Do the only run of a job; returns its summary by name."""
     (name,), (run,) = job.names, job.runs
     settings = parse_run(_parser(), job.config, job.frames, run)
     settings.device = job.device
@@ -217,7 +214,7 @@ def grouped(runs: Sequence[Mapping[str, Any]], size: int) -> list[list[int]]:
 
 
 def run_together(job: Job) -> dict[str, dict[str, Any]]:
-    """Do the runs of a job in one rollout; the summaries of those that are wanted by name."""
+    """Do the runs of a job in one rollout; returns the wanted summaries by name."""
     members = members_of(job)
     folders = [None if name in job.complete else job.folder / RUNS / name for name in job.names]
     extras = [{"sweep": {"run": n, "settings": r}} for n, r in zip(job.names, job.runs, strict=True)]
@@ -226,7 +223,7 @@ def run_together(job: Job) -> dict[str, dict[str, Any]]:
 
 
 def members_of(job: Job) -> list[Simulation]:
-    """The simulations of all runs of a job; the parser makes the first one, as it takes longer than a frame of all."""
+    """Simulations of all runs of a job; only the first is parsed, as that takes longer than a frame."""
     import yaml
 
     settings = parse_run(_parser(), job.config, job.frames, job.runs[0])
@@ -286,7 +283,6 @@ class Processes:
         self._places: dict[Future[Outcome], int] = {}
 
     def submit(self, job: Job) -> Future[Outcome]:
-        """See ``Pool.submit``."""
         place = self._free.pop(0)
         if place not in self._executors:
             environment = {"OMP_NUM_THREADS": str(self.threads), "GOMP_SPINCOUNT": os.getenv("GOMP_SPINCOUNT", "3000")}
@@ -303,7 +299,6 @@ class Processes:
         return future
 
     def outcome(self, job: Job, future: Future[Outcome]) -> Outcome:
-        """See ``Pool.outcome``."""
         place = self._places.pop(future)
         self._free.insert(0, place)
         try:
@@ -320,12 +315,10 @@ class Processes:
         return outcome
 
     def close(self) -> None:
-        """See ``Pool.close``."""
         for executor in self._executors.values():
             executor.shutdown()
 
     def stop(self) -> None:
-        """See ``Pool.stop``; an impatient second Ctrl-C kills them."""
         try:
             for executor in self._executors.values():
                 for process in list(executor._processes.values()):
@@ -350,7 +343,6 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _without_ctrl_c() -> Iterator[None]:
-    """Block Ctrl-C for the processes that are started in the block; here it acts after the block."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
@@ -399,14 +391,12 @@ class Ray:
         self._references: dict[Future[Outcome], Any] = {}
 
     def submit(self, job: Job) -> Future[Outcome]:
-        """See ``Pool.submit``."""
         reference = self._task.options(name=f"run {job.names[0]}", **self._options).remote(job, *self._given)
         future: Future[Outcome] = reference.future()
         self._references[future] = reference
         return future
 
     def outcome(self, job: Job, future: Future[Outcome]) -> Outcome:
-        """See ``Pool.outcome``."""
         del self._references[future]
         try:
             return future.result()
@@ -415,7 +405,6 @@ class Ray:
             return _lost(job, f"Ray ended its process ({told}): use fewer `--workers` if it was memory, or --resume.")
 
     def stop(self) -> None:
-        """See ``Pool.stop``."""
         try:
             for reference in self._references.values():
                 self._ray.cancel(reference)
@@ -424,7 +413,6 @@ class Ray:
             self.close()
 
     def close(self) -> None:
-        """See ``Pool.close``."""
         if self._ours:
             self._ray.shutdown()
 

@@ -29,9 +29,6 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2, pa
         target: Photo, of the same shape.
         ssim_weight: Weight w of the structural part, 0 to 1.
         padding: See :func:`ssim_map`. With ``valid``, each part is the mean over the pixels that it is defined for.
-
-    Returns:
-        A number.
     """
     difference = (image - target).abs().mean()
     if ssim_weight == 0.0:
@@ -43,10 +40,8 @@ def anisotropy_loss(log_scales: Tensor, a: float = 1.1, ratio: str = "paper", re
     r"""Penalty on elongated Gaussians, :math:`\max(S^1 / S^2 - a, 0)` (Gaussian Swaying, "Training").
 
     Args:
-        log_scales: Logarithm of the standard deviations [scene units], shape (N, 3).
         ratio: ``paper`` divides the largest by the second largest scale, so that discs are free; ``max_min`` (Xie et
             al. 2024, "PhysGaussian") divides the largest by the smallest, which asks for balls.
-        reduction: ``mean`` or ``sum`` over the Gaussians.
 
     Returns:
         A number, 0 without Gaussians.
@@ -69,7 +64,6 @@ def opacity_entropy_loss(opacities: Tensor, reduction: str = "mean") -> Tensor:
 
     Args:
         opacities: Opacities from 0 to 1, shape (N,); values below 1e-7 count as that, where the gradient is zero.
-        reduction: ``mean`` or ``sum`` over the Gaussians.
 
     Returns:
         A number, 0 without Gaussians.
@@ -82,9 +76,7 @@ def size_loss(log_scales: Tensor, b: float = 0.008, reduction: str = "mean") -> 
     r"""Penalty on large Gaussians, :math:`\max(S^1 - b, 0)` of the largest scale (Gaussian Swaying, "Training").
 
     Args:
-        log_scales: Logarithm of the standard deviations [scene units], shape (N, 3).
         b: Scale from which on a Gaussian counts as large [scene units].
-        reduction: ``mean`` or ``sum`` over the Gaussians.
 
     Returns:
         A number [scene units], 0 without Gaussians.
@@ -165,7 +157,7 @@ class LossTerm(nn.Module, ABC):
     needs: frozenset[str] = frozenset()
 
     def share(self, step: int) -> float:
-        """Return the factor on its weight at a step; 0 where it is not computed."""
+        """Factor on the weight at a step; 0 if the term is not computed then."""
         if step < self.start or (step - self.start) % self.every:
             return 0.0
         if self.stop is None:
@@ -322,16 +314,13 @@ class TotalLoss(nn.Module):
         self.terms = nn.ModuleDict(self._by_name)
 
     def active(self, step: int) -> dict[str, LossTerm]:
-        """The terms that are computed at a step, by name."""
         return {name: term for name, term in self._by_name.items() if term.share(step)}
 
     def needs(self, step: int) -> frozenset[str]:
-        """Return the inputs that the active terms need, see :data:`NEEDS`."""
         wanted: frozenset[str] = frozenset()
         return wanted.union(*(term.needs for term in self.active(step).values()))
 
     def forward(self, inputs: LossInputs) -> tuple[Tensor, Mapping[str, Tensor]]:
-        """The sum, with its gradient, and each active term before its weight, detached."""
         terms = self.active(inputs.step)
         values = {name: term(inputs) for name, term in terms.items()}
         for name, value in values.items():

@@ -1,5 +1,3 @@
-"""The installed program, and configurations by name."""
-
 import os
 import runpy
 import subprocess
@@ -54,7 +52,6 @@ def test_what_ends_a_command_before_it_runs(tmp_path, body, code, told):
 
 
 def test_what_torch_would_not_explain(tmp_path, monkeypatch, capsys):
-    """Before it is loaded; no module is needed for the version."""
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "abc")
     refused(main, ["export"], capsys, "The environment variable SOURCE_DATE_EPOCH is not a whole number")
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "0")
@@ -75,7 +72,6 @@ def test_each_command_has_its_own_help(name, capsys):
 
 @pytest.mark.parametrize("name", ["sim", "preview", "eval", "export", "train", "convert_physgaussian"])
 def test_each_tool_is_a_program(name, monkeypatch, capsys):
-    """In this process; test_simulate.py starts one in its own."""
     monkeypatch.setattr(sys, "argv", [f"tools/{name}.py", "--help"])
     with pytest.raises(SystemExit) as left:
         runpy.run_path(str(ROOT / "tools" / f"{name}.py"), run_name="__main__")

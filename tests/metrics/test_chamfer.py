@@ -1,5 +1,3 @@
-"""Chamfer distance against brute force and closed forms."""
-
 import pytest
 import torch
 from shared import value_error
@@ -50,7 +48,6 @@ def test_a_tree_looks_at_few_pairs(monkeypatch):
 
 
 def _watch(monkeypatch):
-    """Sizes of the matrices of distances from now on."""
     sizes = []
     cdist = torch.cdist
 

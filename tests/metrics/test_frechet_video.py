@@ -1,5 +1,3 @@
-"""Fréchet distance on Gaussians with a known one, and on videos with a network whose features are known."""
-
 import hashlib
 import math
 
@@ -69,7 +67,6 @@ def test_equal_gaussians_have_no_distance(device):
 
 
 def test_diagonal_gaussians():
-    """Sum of squared differences of means and of standard deviations."""
     mean1, mean2 = torch.tensor([1.0, -2.0, 0.5]), torch.tensor([0.0, 1.0, 0.5])
     std1, std2 = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([2.0, 0.5, 3.0])
     found = frechet_distance(mean1, std1.square().diag(), mean2, std2.square().diag())

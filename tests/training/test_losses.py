@@ -1,5 +1,3 @@
-"""The terms of the objective against closed forms, another implementation and their derivatives."""
-
 import math
 
 import pytest
@@ -63,7 +61,6 @@ def test_photometric_gradient():
 
 
 def _of_each(loss, values):
-    """The loss of each Gaussian alone."""
     return torch.stack([loss(one) for one in values.split(1)])
 
 
