@@ -32,9 +32,6 @@ NOISE = 0.5
 HELD, LEAST_HELD = 7, 6
 """One of so many tracks is not fitted, if there are at least so many of them."""
 
-Tick = Callable[[int], object]
-"""Called with the number of variants that reached one more frame."""
-
 
 class Evidence:
     """What one camera shows: positions of Gaussians in the simulation are compared with those followed in its video.
@@ -85,7 +82,7 @@ def compare(
     values: Sequence[Values],
     times: Sequence[float],
     moving: bool = False,
-    tick: Tick = lambda count: None,
+    tick: Callable[[int], object] = int,
 ) -> Block:
     """Simulate variants, and compare each with the videos at some times [s], ascending.
 
@@ -104,7 +101,7 @@ def compare_starts(
     values: Sequence[Values],
     times: Sequence[float],
     starts: Sequence[float],
-    tick: Tick = lambda count: None,
+    tick: Callable[[int], object] = int,
 ) -> list[Block]:
     """Compare variants as if each had begun to move at each of some times of the film, from one simulation of each.
 
@@ -126,7 +123,7 @@ def _compared(
     wanted: Sequence[tuple[float, Sequence[tuple[int, float]]]],
     count: int,
     careful: bool,
-    tick: Tick,
+    tick: Callable[[int], object],
 ) -> list[Block]:
     """Blocks of residuals: the state at each time is compared for blocks of some numbers with frames at some times."""
     parts: list[list[tuple[Tensor, Tensor, Tensor]]] = [[] for _ in range(count)]
