@@ -197,7 +197,7 @@ def film_of(simulation: Simulation, grid: GridSpec, nodes: Tensor, displacement:
 
 
 def order_of(scene: SimulatedScene) -> tuple[Tensor, Tensor]:
-    """The order of the Gaussians in a film: those that move come first, and any first part of either is spread.
+    """The order of the Gaussians in a film: those that move come first. The first of either are spread over all of it.
 
     Returns:
         The order of ``scene.moving``, as indices in it, shape (L,), and of all, as indices in the splat, shape (N,).
