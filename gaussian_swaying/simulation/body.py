@@ -31,6 +31,7 @@ from gaussian_swaying.gaussians.connectivity import attached_pairs
 from gaussian_swaying.gaussians.filling import Filling, InteriorFilling, density_grid
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.grouping import grid_groups, loose_points
+from gaussian_swaying.gaussians.material_fields import MaterialField, MaterialFile, MaterialSource
 from gaussian_swaying.gaussians.model import DeformedGaussians, GaussianSurfaceModel
 from gaussian_swaying.gaussians.openness import openness
 from gaussian_swaying.gaussians.parts import NUMBERS, PartRegion, Parts
@@ -58,14 +59,17 @@ from gaussian_swaying.mpm.materials import known_material
 from gaussian_swaying.mpm.pins import PinnedRegion, RigidRegion
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.mpm.state import MaterialPoints, State, bounding_grid
+from gaussian_swaying.mpm.timestep import wave_speed
 from gaussian_swaying.mpm.virtual_nodes import first_nodes, virtual_nodes
 from gaussian_swaying.scenes.procedural import ProceduralScene
 from gaussian_swaying.wind.patches import Patches, joined_directions, second_moments
 
 if TYPE_CHECKING:
     PartsLike = str | os.PathLike[str] | Parts
+    MaterialsLike = MaterialSource | str | os.PathLike[str]
 else:  # what a YAML file can contain
     PartsLike = str | os.PathLike[str]
+    MaterialsLike = MaterialSource | str
 
 
 class Scene(Fixed):
@@ -79,6 +83,9 @@ class Scene(Fixed):
         parts: Which part each Gaussian belongs to, and whether a part is soft, held or still (``parts.npz``, see
             :mod:`~gaussian_swaying.gaussians.parts`); in Python also :class:`~gaussian_swaying.gaussians.parts.Parts`.
             Null for one soft part.
+        materials: A material for each Gaussian: an .npz file, or a
+            :class:`~gaussian_swaying.gaussians.material_fields.MaterialFile` with a largest E. Parts and
+            ``material.regions`` win over it. Null for the one of ``material``.
         opacity_threshold: Gaussians in the region below this opacity carry no mass and feel no wind.
         faint: Treatment of Gaussians below that opacity: ``carry`` (they follow their nearest simulated neighbour),
             ``static`` or ``drop``.
@@ -137,6 +144,7 @@ class Scene(Fixed):
         *,
         region: Region | None = None,
         parts: PartsLike | None = None,
+        materials: MaterialsLike | None = None,
         opacity_threshold: float = 0.1,
         faint: Literal["carry", "static", "drop"] = "carry",
         up: list[float] = [0.0, 0.0, 1.0],  # noqa: B006  (never changed; the schema of the config shows it)
@@ -193,6 +201,14 @@ class Scene(Fixed):
                 "A part of `scene.parts` is `attached` to one other, which has no effect with `scene.connected: grid`: "
                 "set that to surface, or remove `attached`."
             )
+        if isinstance(materials, str | os.PathLike):
+            if not os.fspath(materials).endswith(".npz"):
+                raise ValueError(
+                    "Expected `scene.materials` to be an .npz file, or `class_path` and `init_args` of a "
+                    f"MaterialSource that can be imported, but got {shown(materials)}."
+                )
+            materials = MaterialFile(materials)
+        self.materials = materials
         self.opacity_threshold, self.faint, self.up = float(opacity_threshold), faint, list(up)
         self.longest_side, self.metres_per_unit, self.area = longest_side, metres_per_unit, area
         self.filling, self.wind_on = filling, wind_on
@@ -514,6 +530,25 @@ def check_density(means: Tensor, metres_per_unit: float, dx: float) -> None:
         )
 
 
+SLOWER = 3.0
+"""Substeps that the stiffest material takes, over those of the median, from which on it is told."""
+
+
+def tell_cost(points: MaterialPoints) -> None:
+    """Warn if the stiffest of a field of materials takes many more substeps than most of it needs."""
+    speed = wave_speed(points).detach().cpu()
+    ratio = float(speed.amax() / speed.median())
+    if ratio > SLOWER:
+        E, few = float(points.youngs_modulus.amax()), float((speed > 0.5 * speed.amax()).double().mean())
+        warnings.warn(
+            f"`scene.materials` has E up to {E:.3g} Pa: {few:.1%} of the material make a frame take {ratio:.3g} times "
+            "the substeps that the median would. `scene.materials.max_E` makes it softer, `rigid_E` rigid, and in "
+            "`solver.formulation: modes` it costs nothing.",
+            UserWarning,
+            stacklevel=2,
+        )
+
+
 def suggest_spacing(longest_side: float, spacing: float, cells: int) -> float:
     """Grid spacing: the longest side over ``cells``, at least twice the particle spacing, rounded to 2 digits.
 
@@ -686,18 +721,29 @@ def joints_of(
     return tuple(found)
 
 
-def with_parts(scene: Scene, cloud: GaussianCloud, material: Material, solver: Solver) -> tuple[Material, Solver]:
+def with_parts(
+    scene: Scene, cloud: GaussianCloud, material: Material, solver: Solver, field: MaterialField | None = None
+) -> tuple[Material, Solver]:
     """Material and solver, extended by the parts of a scene, if it has any.
 
     Args:
         material: Its ``regions`` come after those of the parts, and win.
-        solver: Gets a body for each part that is rigid, and a pin for all that are held, which holds nodes of the grid.
+        solver: Gets a body for each part that is rigid and for each rigid body of the ``field``, and a pin for all that
+            are held, which holds nodes of the grid.
     """
     parts = scene.parts
-    if parts is None:
+    if parts is None and field is None:
         return material, solver
     chosen = scene.select(cloud)
-    means, labels = cloud.means[chosen], parts.labels[chosen]
+    means = cloud.means[chosen]
+    if field is not None:
+        bodies = [PartRegion(f"rigid {k + 1}", means, body) for k, body in enumerate(field.rigid_bodies(means))]
+        if bodies:
+            boundaries = FixedList([*solver.boundaries, *map(RigidRegion, bodies)])
+            solver = changed(solver, boundaries=boundaries)
+    if parts is None:
+        return material, solver
+    labels = parts.labels[chosen]
     regions = [
         MaterialRegion(PartRegion(part.name, means, labels == k), **{name: getattr(part, name) for name in NUMBERS})
         for k, part in enumerate(parts.parts)
@@ -725,7 +771,7 @@ SHARED = 4
 
 SIMPSON = (2 / 3, 1 / 6, 1 / 6)  # middle plane and faces of a sheet: exact for the square of the height
 _PROPERTIES = ("E", "nu", "density", "thickness", "bending", "damping_ratio")
-_KINDS = ("E", "nu", "density", "thickness", "bending", "damping")
+_NUMBERS = ("E", "nu", "density", "thickness", "bending", "damping")
 
 
 @dataclass(frozen=True)
@@ -746,6 +792,8 @@ class Samples:
         damping: Rates at which the velocity decays [1/s], shape (N,).
         law_index: Which law applies to each, int64, shape (N,).
         surface: Which are on the surface, bool, shape (N,).
+        kind: With a field of materials, of which a group takes the mean: the samples that may share a group have the
+            same number, shape (N,). None for those of the same material.
     """
 
     position: Tensor
@@ -761,6 +809,7 @@ class Samples:
     damping: Tensor
     law_index: Tensor
     surface: Tensor
+    kind: Tensor | None = None
 
     @property
     def mass(self) -> Tensor:
@@ -773,7 +822,8 @@ class Samples:
         return layer_distance(self.bending, self.E, self.nu, self.thickness)
 
     def choose(self, index: Tensor) -> Samples:
-        return Samples(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+        known = {f.name: getattr(self, f.name) for f in fields(self)}
+        return replace(self, **{name: value[index] for name, value in known.items() if value is not None})
 
     def points(
         self, layers: int, laws: Sequence[ConstitutiveLaw], dtype: torch.dtype, attached: Tensor | None = None
@@ -817,6 +867,7 @@ def sample_object(
     frame: SimFrame,
     dx: float,
     layers: int,
+    field: MaterialField | None,
 ) -> tuple[Samples, list[ConstitutiveLaw]]:
     """The samples of an object with their material, and the laws of the material.
 
@@ -826,6 +877,7 @@ def sample_object(
         body_area: Areas that carry material [m²], shape (S,).
         area: Areas that feel the wind [m²], shape (S,).
         dx: Grid spacing [m], for ``material.volume = "cell"``.
+        field: Numbers that win over those of the whole material, but not over its regions.
     """
     surface = torch.ones(len(position), dtype=torch.bool)
     if filling is not None:
@@ -838,6 +890,9 @@ def sample_object(
     given = {name: getattr(material, name) for name in _PROPERTIES}
     properties = {name: torch.full_like(area, _number(v)) for name, v in given.items()}
     laws, index = [material.law or FixedCorotated()], torch.zeros(len(position), dtype=torch.long)
+    for name, values in ({} if field is None else field.at(where)).items():
+        properties[name] = torch.where(values.isnan(), properties[name], values)
+    masks: list[Tensor] = []
     for entry in material.regions:
         inside_region = entry.region.contains(where)
         if not bool(inside_region.any()):
@@ -846,6 +901,7 @@ def sample_object(
                 f"The region {entry.region!r} of `material.regions` holds no simulated Gaussian: they lie {between}; "
                 f"{hint or 'move or enlarge it'}."
             )
+        masks.append(inside_region)
         for name in _PROPERTIES:
             if getattr(entry, name) is not None:
                 properties[name][inside_region] = _number(getattr(entry, name))
@@ -872,9 +928,10 @@ def sample_object(
     of_plate = plate_stiffness(properties["E"], properties["nu"], properties["thickness"])
     bending = torch.where(bending.isinf() | (bending.isnan() & (layers == 3)), of_plate, bending.nan_to_num(0.0))
     damping = decay_rate(1.0, 1.0) * properties.pop("damping_ratio").nan_to_num(0.0)
+    kind = None if field is None else equal_rows(torch.stack(masks or [index], -1))
     found = Samples(
         position, normal, body_area, area, volume, **properties, bending=bending, damping=damping, law_index=index,
-        surface=surface,
+        kind=kind, surface=surface,
     )  # fmt: skip
     return found, laws
 
@@ -911,8 +968,8 @@ def grouped(
 ) -> tuple[Samples, Tensor, Tensor]:
     """Group samples for a grid: a few points per group, with its mass, centre of mass and volume.
 
-    A group never mixes materials, laws, the surface and the inside, samples that feel wind and samples that do not,
-    pieces, or the two sides of the border of a region in ``apart``.
+    A group never mixes kinds of material, laws, the surface and the inside, samples that feel wind and samples that do
+    not, pieces, or the two sides of the border of a region in ``apart``.
 
     Args:
         piece: A number for each sample, the same for those that are attached in their cell, shape (N,); None if all
@@ -923,12 +980,12 @@ def grouped(
         The points as samples, those on the surface first; the point that each sample belongs to, shape (N,); and the
         group of each point, shape (P,).
     """
-    kinds = torch.stack([getattr(samples, name) for name in _KINDS], -1)
-    kind = equal_rows(kinds)
     where = frame.point_to_scene(samples.position)
     masks = [region.contains(where) for region in apart]
     pieces = [] if piece is None else [piece]
-    label = torch.stack([kind, samples.law_index, samples.surface, samples.area > 0, *masks, *pieces], -1).long()
+    kind = equal_rows(torch.stack([getattr(samples, name) for name in _NUMBERS], -1))
+    kinds = kind if samples.kind is None else samples.kind, samples.law_index, samples.surface, samples.area > 0
+    label = torch.stack([*kinds, *masks, *pieces], -1).long()
     home = samples.position if home is None else home
     matched = per_cell % 2 == 0
     cubes = per_cell // 2 if matched else per_cell
@@ -1014,6 +1071,10 @@ def _points_of(samples: Samples, group: Tensor, parts: Tensor, side: float) -> t
     normal = torch.where(solid[:, None], 0.0, torch.where(alone[:, None], found.normal, axis))
     areas = {name: sums(getattr(samples, name), owner, count) for name in ("body_area", "area")}
     volume = sums(samples.volume, group)[of] / share
+    for name in _NUMBERS:
+        values = getattr(samples, name)
+        if bool((values != values[first][group]).any()):  # a field of materials
+            areas[name] = (sums(samples.volume * values, group) / sums(samples.volume, group))[of]
     return replace(found, position=position, normal=normal, volume=volume, **areas), owner, of
 
 
@@ -1226,6 +1287,7 @@ def body_of(
     by_grid: bool,
     apart: Sequence[Region],
     labels: Tensor | None = None,
+    field: MaterialField | None = None,
 ) -> Body:
     """Turn Gaussians into what a solver takes: samples, their areas and material, groups, patches.
 
@@ -1253,7 +1315,7 @@ def body_of(
     body_area = frame.area_to_sim(areas).double()
     area = body_area if scene.wind_on == "all" else torch.where(outer, body_area, 0)
     facing = frame.direction_to_sim(normals[source].double())
-    samples, laws = sample_object(position, facing, body_area, area, filling, material, frame, dx, scene.layers)
+    samples, laws = sample_object(position, facing, body_area, area, filling, material, frame, dx, scene.layers, field)
     chosen, owner, feels = samples, torch.arange(len(samples.position)), samples.area > 0
     patches = samples.normal[feels], samples.area[feels], owner[feels]
     pairs = piece = home = parent = None
@@ -1398,6 +1460,7 @@ class SimulatedScene(nn.Module):
         apart: Regions whose borders no group of Gaussians crosses, in scene units: those of pins and edits.
         embedded: Returns how places are read from a state (``Solver.embedded``); where it returns None, the Gaussians
             follow the points.
+        field: Materials that differ from Gaussian to Gaussian.
 
     Attributes:
         simulated: Indices of the simulated Gaussians.
@@ -1423,6 +1486,7 @@ class SimulatedScene(nn.Module):
             ``scene.connected: surface``; else None.
         source: The .ply file; None for a scene made in code.
         parts: The labels of its Gaussians, with roles and materials, or None.
+        field: The materials of its Gaussians, or None.
     """
 
     def __init__(
@@ -1435,10 +1499,11 @@ class SimulatedScene(nn.Module):
         fixed: bool = True,
         apart: Sequence[Region] = (),
         embedded: Callable[..., EmbeddedPoints | None] = EmbeddedInGrid,
+        field: MaterialField | None = None,
     ) -> None:
         super().__init__()
         cloud = scene.cloud() if cloud is None else cloud
-        self.source, self.parts = scene.ply, scene.parts
+        self.source, self.parts, self.field = scene.ply, scene.parts, field
         by_grid = scene.points == "grid" or (scene.points is None and fixed)
         if by_grid and not fixed:
             raise ValueError(
@@ -1483,8 +1548,10 @@ class SimulatedScene(nn.Module):
             normals = normals.index_put((simulated,), neighbour_normals(*parts))
         part = cloud.select(simulated)
         labels = None if scene.parts is None else scene.parts.labels[self.drawn][simulated]
-        body = body_of(part, normals[simulated], scene, material, self.frame, dx, dtype, by_grid, apart, labels)
+        body = body_of(part, normals[simulated], scene, material, self.frame, dx, dtype, by_grid, apart, labels, field)
         self.points, self.patches = body.points, body.patches
+        if field is not None:
+            tell_cost(body.points)
         self.joints = self._joints(scene, labels, body, dx)
         self.pairs = None if body.pairs is None else body.pairs[(body.pairs < len(simulated)).all(1)]
         self.on_surface, self.filled = body.on_surface, body.points.count // scene.layers - body.on_surface

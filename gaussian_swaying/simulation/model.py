@@ -220,10 +220,10 @@ def _with_material(model: Model, numbers: Mapping[str, Any]) -> Model:
     points, material = model.points, model.material
     bends = material.bending is not None or any(part.bending is not None for part in material.regions)
     for name in numbers:
-        if any(getattr(part, name) is not None for part in material.regions):
+        if any(getattr(part, name) is not None for part in (*material.regions, model.scene.field) if part is not None):
             raise ValueError(
-                f"`material.{name}` is to change, but `material.regions` or `scene.parts` gives it too: remove it "
-                "there."
+                f"`material.{name}` is to change, but `material.regions`, `scene.parts` or `scene.materials` gives it "
+                "too: remove it there."
             )
         if bends and points.bending is None and name in ("E", "nu"):
             raise ValueError(

@@ -222,12 +222,13 @@ class Simulation(Fixed):
             if hold is not None:
                 raise ValueError("`hold` cannot be combined with `normalisation`: give a solver with the pins.")
             settings, material, solver, edits = normalisation.place(settings, material, solver, edits, cloud)
-        material, solver = with_parts(settings, cloud, material, solver)
+        field = None if settings.materials is None else settings.materials(cloud)
+        material, solver = with_parts(settings, cloud, material, solver, field)
         apart = [
             part.region for part in (*solver.boundaries, *edits) if isinstance(getattr(part, "region", None), Region)
         ]
         fixed, kind = bool(solver.neighbours_fixed), getattr(torch, dtype)
-        seen = SimulatedScene(settings, material, solver.dx, kind, cloud, fixed, apart, solver.embedded)
+        seen = SimulatedScene(settings, material, solver.dx, kind, cloud, fixed, apart, solver.embedded, field)
         if contact is not None and not fixed:
             raise ValueError(
                 "`contact` needs `solver.formulation: total`: leave it out, as in `updated` material meets on the grid."
