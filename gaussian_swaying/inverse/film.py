@@ -218,24 +218,11 @@ def _differs(first: Any, grey: Any, where: Any) -> bool:
     return bool((abs(level - before) > DIFFERENT).mean() > MOVED_SHARE)
 
 
-@dataclass(frozen=True)
-class HeldEnd:
-    """The end that does not move, ``top``, ``bottom``, or ``+x`` to ``-z`` of the splat, and the direction there, (3,).
-
-    Points there move by ``moves``, and the liveliest quarter of all by ``others`` [pixels].
-    """
-
-    name: str
-    direction: tuple[float, ...]
-    moves: float
-    others: float
-
-
-def held_end(places: Tensor, moved: Tensor, up: Sequence[float]) -> HeldEnd | None:
+def held_end(places: Tensor, moved: Tensor, up: Sequence[float]) -> tuple[str, float, float] | None:
     """Find the end of an object that moves least in a film, from how far points (T, 3) of it go, (T,) [pixels].
 
-    Returns:
-        None if no end is much more still than the rest, as in an object that is held at a corner or within.
+    Its name, ``top``, ``bottom``, or ``+x`` to ``-z`` of the splat, and how far it and the liveliest quarter of the
+    points go. None if no end is much more still than the rest, as in an object that is held at a corner or within.
     """
     if len(moved) < 4 * FEWEST or (others := float(moved.quantile(0.75))) < LEAST_MOTION:
         return None
@@ -255,7 +242,7 @@ def held_end(places: Tensor, moved: Tensor, up: Sequence[float]) -> HeldEnd | No
     if not found or min(found)[0] > STILL * others:
         return None
     moves, name = min(found)
-    return HeldEnd(name, tuple(ends[name].tolist()), moves, others)
+    return name, moves, others
 
 
 def moving_box(places: Tensor, moved: Tensor, cloud: GaussianCloud) -> tuple[Tensor, Tensor] | None:

@@ -76,24 +76,15 @@ OURS = (PROGRESS, "page.html", "values.csv", "result.json", "scene.yaml", PICTUR
 
 UNSETTLED = "The values have not settled: `iterations` ran out: raise it and continue with --resume."
 
-STEPS = (
-    ("tracks", 0.25),
-    ("tracks", 0.5),
-    ("matches", 0.5),
-    ("matches", 0.5),
-    ("matches", 0.75),
-    ("matches", 1.0),
-    ("matches", 1.0),
-)
-"""What is compared in each step, and the share of the fitted frames that it takes: Gaussians that were followed from
-frame to frame, then those that are matched from rendered frames to frames of the video.
+FOLLOWED = (0.25, 0.5)
+"""Shares of the fitted frames in which points are followed from frame to frame, from each start.
 
 Chaos grows with time: in a flapping flag, a change of Young's modulus by a hundredth makes pixels of difference
 within two seconds, and over the whole video the cost has local minima far from the global one. So the first horizon is
 the shortest time that determines the unknowns, and its solution must be exact before time is added."""
 
-TRUSTED = 0.5
-"""Share of the fitted frames from which other grids tell which points to trust."""
+STEPS = (0.5, 0.5, 0.75, 1.0, 1.0)
+"""Then shares in which Gaussians are matched from rendered frames to frames of the video, one after the other."""
 
 STARTS = 3
 """Starts that the search gives to short solves."""
@@ -280,10 +271,10 @@ class Problem:
                     found.append((sum(int(own.seen[0].sum()) for own in tracks), place))
         return max(found, key=itemgetter(0))[1]
 
-    def evidence(self, kind: str, matched: Sequence[float] = ()) -> list[Evidence]:
-        """What each video shows: ``tracks``, or ``matches`` that are made at a place."""
-        tracks = self.tracks if kind == "tracks" else []
-        if kind == "matches":
+    def evidence(self, matched: Sequence[float] | None = None) -> list[Evidence]:
+        """What each video shows: points that are followed, or that are matched at a place."""
+        tracks = self.tracks if matched is None else []
+        if matched is not None:
             states = dict(zip(self.fitted, self._states(matched, self.fitted), strict=True))
             for video in self.videos:
                 own = [state for moment, state in states.items() if video.frame_at(moment) is not None]
@@ -342,7 +333,7 @@ class Problem:
             self.begin_at(self.begin_from(places[:BEGUN]))
         if given:
             places = torch.cat([begin, places])
-        evidence, times, known = self.evidence("tracks"), self._until(SEARCHED), self.begins
+        evidence, times, known = self.evidence(), self._until(SEARCHED), self.begins
         starts = [0.0 if known is None or known.start is None else known.start]
         if known is not None and known.start is None:  # in a steady wind one simulation shows what any start would
             step = max(times[1] - times[0], (known.high - known.low) / MOST_STARTS)
@@ -367,11 +358,8 @@ class Problem:
 
         Horizons grow, and at each the worse half is left.
         """
-        ended, costs, left = [list(place) for place in places], [0.0], len(places)
-        if left < 2:
-            return ended
-        evidence = self.evidence("tracks")
-        for share in (share for kind, share in STEPS if kind == "tracks"):
+        ended, costs, left, evidence = [list(place) for place in places], [0.0], len(places), self.evidence()
+        for share in FOLLOWED:
             times = self._until(share)
             ended, costs = self._brief(ended[:left], evidence, times)
             for place, cost in zip(ended, costs, strict=True):
@@ -393,7 +381,7 @@ class Problem:
                 own, shown = copy(self), evidence
                 if shown is None:
                     own.begin_at(place)
-                    shown = own.trusted(own.evidence("tracks"), place)
+                    shown = own.trusted(own.evidence(), place)
                 found.append(own.solved(place, shown, times, BRIEF, False))
                 more.append(distrust(shown, times) if evidence is None else 0.0)
         if not found:
@@ -419,7 +407,7 @@ class Problem:
         if not tried:
             return [], []
         try:
-            evidence = None if self.moving else self.trusted(self.evidence("tracks"), place)
+            evidence = None if self.moving else self.trusted(self.evidence(), place)
             ended, costs = self._brief([list(place), *tried], evidence, self.fitted)
         except DivergedError:
             return [], []
@@ -440,7 +428,7 @@ class Problem:
             begin = time.monotonic()
             for _ in states_of(self.simulation, [self.values(self.middle)] * batch, times):
                 pass
-        count = SEARCHED * self.plan.search + 3 * batch * sum(share for _, share in STEPS)
+        count = SEARCHED * self.plan.search + 3 * batch * sum(STEPS)
         count += BRIEF * batch * (STARTS + 3) + REFINED * batch * len(GRIDS)
         seconds = count * (time.monotonic() - begin) / batch
         told = f"about {count:.0f} simulations of {self.fitted[-1]:.3g} s: some {duration(seconds)}"
@@ -487,7 +475,7 @@ class Problem:
             if self.moving:
                 self.begin_at(better)
                 course.first = list(better)
-            course.step, course.matched = next(k for k, (_, share) in enumerate(STEPS) if share == 1), []
+            course.step, course.matched = STEPS.index(1.0), []
             course.tried, course.ended = 0, ""
             kept()
         result = self.result(course, evidence, films, others)
@@ -496,20 +484,17 @@ class Problem:
     def _stepped(self, course: Course, kept: Callable[[], None]) -> list[Evidence]:
         """Do the steps from that of the course on, and return the evidence of the last one."""
         for number in range(course.step, len(STEPS)):
-            (kind, share), last = STEPS[number], number == len(STEPS) - 1
-            times, course.matched = self._until(share), course.matched or list(course.place)
-            evidence = self.evidence(kind, course.matched)
-            if share >= TRUSTED:
-                evidence = self.trusted(evidence, course.matched)
+            times, last = self._until(STEPS[number]), number == len(STEPS) - 1
+            course.matched = course.matched or list(course.place)
+            evidence = self.trusted(self.evidence(course.matched), course.matched)
             left = self.plan.iterations - course.tried // TRIES
             if course.ended or left <= 0:  # it is continued after its end
                 return evidence
             found = self.solved(course.place, evidence, times, left, last)
             course.place = found.place.tolist()
-            row = {"compared": kind, "until": times[-1], "steps": found.steps, "cost": found.cost}
-            row |= {"ended": found.ended, "pixels": found.scale}
-            course.history.append(row | self.values(course.place))
-            self.say(f"{kind} to {times[-1]:.3g} s, {found.steps} steps: {self._shown(course.place)}")
+            row = {"until": times[-1], "steps": found.steps, "cost": found.cost, "ended": found.ended}
+            course.history.append(row | {"pixels": found.scale} | self.values(course.place))
+            self.say(f"matches to {times[-1]:.3g} s, {found.steps} steps: {self._shown(course.place)}")
             if last:
                 course.ended, course.tried = found.ended, course.tried + found.steps
             else:
@@ -594,7 +579,7 @@ class Problem:
     def _check_apart(self, place: Sequence[float]) -> None:
         """Raise ValueError if the unknowns cannot be told apart at a place."""
         at = torch.tensor(place, dtype=torch.float64)
-        normal = linearised(self.residuals(self.evidence("tracks"), self.fitted), at)
+        normal = linearised(self.residuals(self.evidence(), self.fitted), at)
         found = directions(normal.matrix, self.plan.unknowns, at)
         for strength, _, told in found:
             self.say(f"sensitivity {strength:9.3g}: {told}")
@@ -675,7 +660,8 @@ def _ready(plan: Plan, parser: Any, settings: Any, device: str, progress: bool) 
     own.camera = own.cameras = None  # the videos have their own
     simulation, say = Simulation.from_settings(parser, own), Say(progress)
     videos = read_videos(list(plan.videos), plan.cameras, simulation.scene.size, simulation.scene.model.origin)
-    looked = _looked(simulation, videos, plan)
+    moving = any(u.name == FILM_START and u.low < 0 for u in plan.unknowns)
+    looked = [told for video in videos for told in first_look(simulation, video, moving)]
     with say.work("the camera of each frame", sum(len(video.times) for video in videos)):
         videos, judged = prepared(simulation, videos, plan.hand_held, plan.also_moves, say, say.tick)
 
@@ -693,21 +679,6 @@ def _other_grids(parser: Any, settings: Any, say: Say) -> list[Simulation]:
                 found.append(Simulation.from_settings(parser, given))
         except ValueError as error:
             say(f"cells {ratio:g} times as large, to know the error of the grid, are not possible: {error}")
-    return found
-
-
-def _looked(simulation: Simulation, videos: Sequence[Footage], plan: Plan) -> list[str]:
-    """Sentences on cameras that are not where they are said to be; ValueError if a film does not show the splat."""
-    found, moving = [], any(u.name == FILM_START and u.low < 0 for u in plan.unknowns)
-    for video in videos:
-        shown, told = first_look(simulation, video)
-        if not shown and not moving:
-            raise ValueError(
-                f"The first frame of camera {video.name} does not show the splat where its camera looks: give a film "
-                "of this splat, or find its camera with `gaussian-swaying camera FILM SPLAT` (its places may be in "
-                f"another unit); if it begins in motion, add {FILM_START}: {{range: [-1, 0]}} to `unknowns`."
-            )
-        found += [told] if told else []
     return found
 
 

@@ -242,10 +242,9 @@ def _shown(seen: Seen, video: Footage, preview: Suggestion, wanted: dict[str, An
         places, moved = places[inside], moved[inside]
     held = None if wanted["hold"] is not None else held_end(places, moved, up)
     if held is not None:
-        shown["hold"] = held.name
+        shown["hold"], own, others = held
         told.append(
-            f"held: {held.name}, as the film shows; that end moves by {held.moves:.1f} pixels, the rest by "
-            f"{held.others:.0f}"
+            f"held: {shown['hold']}, as the film shows; that end moves by {own:.1f} pixels, the rest by {others:.0f}"
         )
     return shown, told
 

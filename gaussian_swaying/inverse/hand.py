@@ -84,21 +84,6 @@ def _widened(moving: Tensor) -> Tensor:
     return torch.from_numpy(cv2.distanceTransform((~moving).byte().numpy(), cv2.DIST_L2, 5)) <= REACH * side
 
 
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """The cameras of a film.
-
-    Attributes:
-        cameras: The camera of each frame.
-        unseen: Frames that show too little of the background; their cameras lie between those of their neighbours.
-        residual: Median over the frames of the root mean square distance of the points that agree [pixels].
-    """
-
-    cameras: tuple[Camera, ...]
-    unseen: tuple[int, ...]
-    residual: float
-
-
 def moves_by(video: Footage, background: Background) -> float:
     """Distance that the background goes in the film of a camera that is said to stand still [pixels]; 0 if unknown.
 
@@ -129,8 +114,14 @@ def stands_still(video: Footage) -> bool:
     return bool((views == views[:1]).all())
 
 
-def follow_camera(video: Footage, background: Background, tick: Callable[[int], object] = int) -> Motion:
-    """Find the camera of each frame; those of the film may be that of its first frame, or rough ones of all frames."""
+def follow_camera(
+    video: Footage, background: Background, tick: Callable[[int], object] = int
+) -> tuple[Footage, tuple[int, ...], float]:
+    """The video with the camera of each frame; its own may be that of the first frame, or rough ones of all.
+
+    Frames that show too little of the background are listed, and have a camera between those of their neighbours. The
+    number is the median over the frames of the root mean square distance of the points that agree [pixels].
+    """
     found: list[Registration | None] = []
     last: Camera | None = None
     for k, given in enumerate(video.cameras):
@@ -154,7 +145,7 @@ def follow_camera(video: Footage, background: Background, tick: Callable[[int], 
             "in the splat."
         )
     residual = torch.tensor([one.residual for one in found if one is not None]).median()
-    return Motion(_filled(video, found), unseen, float(residual))
+    return replace(video, cameras=_filled(video, found)), unseen, float(residual)
 
 
 def _filled(video: Footage, found: Sequence[Registration | None]) -> tuple[Camera, ...]:
@@ -303,9 +294,8 @@ def prepared(
         if hand_held is not False and stands_still(video):
             one.moved = moves_by(video, background)
         if hand_held or (one.moved > STILL and hand_held is None):
-            motion = follow_camera(video, background, tick)
-            video = replace(video, cameras=motion.cameras)
-            one.hand_held, one.residual, one.unseen = True, motion.residual, len(motion.unseen)
+            video, unseen, one.residual = follow_camera(video, background, tick)
+            one.hand_held, one.unseen = True, len(unseen)
         if (bright := gains(video, background)) is not None:
             video = replace(video, images=with_gains(video.images, bright[0]))
             one.gains = bright[0].amin(0).tolist(), bright[0].amax(0).tolist()

@@ -107,14 +107,11 @@ def track(simulation: Simulation, video: Footage, most: int = 400, first: Deform
         first: What that frame shows, about, if it is not the scene at rest. The Gaussians are followed from a picture
             of it to the frame; those whose surroundings do not look alike there are not seen.
     """
-    if first is None:
-        chosen, start = _chosen(simulation, video, _grey(video.images[0]), most)
-        position, seen = map(torch.from_numpy, follow(video.images.numpy(), start.numpy()))
-        return Tracks(chosen, position, seen)
-    drawn = drawn_by(simulation, first, video.cameras[0])
-    chosen, start = _chosen(simulation, video, _grey(drawn), most, first)
-    images = torch.cat([drawn[None], video.images])
+    chosen, start, drawn = _chosen(simulation, video, most, first)
+    images = video.images if first is None else torch.cat([drawn[None], video.images])
     position, seen = map(torch.from_numpy, follow(images.numpy(), start.numpy()))
+    if first is None:
+        return Tracks(chosen, position, seen)
     seen &= alike(images[:2], position[:2]) > ALIKE
     return Tracks(chosen, position[1:], seen[1:])
 
@@ -187,11 +184,7 @@ def match(
     import numpy as np
 
     scene, painter, count = simulation.scene, simulation.painter, len(video.times)
-    if moving:
-        begun = painter.deformed(states[0])
-        chosen, _ = _chosen(simulation, video, _grey(drawn_by(simulation, begun, video.cameras[0])), most, begun)
-    else:
-        chosen, _ = _chosen(simulation, video, _grey(video.images[0]), most)
+    chosen, *_ = _chosen(simulation, video, most, painter.deformed(states[0]) if moving else None)
     index = scene.moving[chosen.to(scene.moving.device)]
     position = torch.zeros(count, len(chosen), 2, dtype=torch.float64)
     seen = torch.zeros(count, len(chosen), dtype=torch.bool)
@@ -261,12 +254,16 @@ def corners(grey: Any, most: int, quality: float, apart: float, mask: Any) -> An
 
 
 def _chosen(
-    simulation: Simulation, video: Footage, grey: Any, most: int, first: DeformedGaussians | None = None
-) -> tuple[Tensor, Tensor]:
-    """Return Gaussians that are visible at first and have texture around them, a few pixels apart; and their pixels."""
+    simulation: Simulation, video: Footage, most: int, first: DeformedGaussians | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return Gaussians that are visible at first and have texture around them, a few pixels apart, and their pixels.
+
+    The picture that shows the texture is the first frame, or that of other Gaussians; it is returned, too.
+    """
     import numpy as np
 
     scene, painter, camera = simulation.scene, simulation.painter, video.cameras[0]
+    image = video.images[0] if first is None else drawn_by(simulation, first, camera)
     with torch.no_grad():
         first, own = first or scene.rest(), camera.to(painter.device)
         pixel, depth = project(first.means[scene.moving], camera)
@@ -275,7 +272,7 @@ def _chosen(
     place = (_in_sight(pixel, depth, picture, BEHIND * scene.size) & opaque).nonzero()[:, 0]
     column, row = pixel[place].long().unbind(-1)
     width, height = video.size
-    texture = torch.from_numpy(np.asarray(opencv().cornerMinEigenVal(grey, 7)))
+    texture = torch.from_numpy(np.asarray(opencv().cornerMinEigenVal(_grey(image), 7)))
     score = texture[row, column]
     sharpest = texture.max() if scene.all_move else score.amax() if len(score) else 0.0  # not that of a background
     good = score > QUALITY * sharpest
@@ -289,7 +286,7 @@ def _chosen(
             taken[r + 2 : r + 7, c + 2 : c + 7] = True
             kept.append(int(place[k]))
     chosen = torch.tensor(sorted(kept), dtype=torch.long)
-    return chosen, pixel[chosen]
+    return chosen, pixel[chosen], image
 
 
 def _in_sight(pixel: Tensor, depth: Tensor, picture: RenderOutput, behind: float) -> Tensor:

@@ -17,8 +17,8 @@ def simulation(own):
 
 @pytest.fixture
 def brief(monkeypatch):
-    """Fits end before Gaussians are matched."""
-    monkeypatch.setattr("gaussian_swaying.inverse.fit.STEPS", (("tracks", 0.25), ("tracks", 0.5), ("tracks", 1.0)))
+    """Gaussians are matched once."""
+    monkeypatch.setattr("gaussian_swaying.inverse.fit.STEPS", (1.0,))
 
 
 @pytest.fixture

@@ -23,18 +23,18 @@ def test_matches_reach_the_lowest_place_of_a_motion_that_soon_depends_on_everyth
 
     def end(steps):
         place = double([0.67])
-        for stage, share in steps:
+        for share in steps:
             time = torch.linspace(0, 2, 49, dtype=torch.float64)[: max(3, round(share * 49))]
 
             def swing(places, time=time):
                 found = torch.sin(60 * places * time.square()) - torch.sin(60 * 0.7 * time.square())
                 return Block(torch.stack([found, 0 * found], -1), torch.arange(len(time)))
 
-            place = solve(swing, place, 8, True, SCALE).place if stage == "matches" else place
+            place = solve(swing, place, 8, True, SCALE).place
         return float(place[0])
 
     assert end(STEPS) == pytest.approx(0.7, abs=1e-4)
-    assert end([("matches", 1.0)] * 3) != pytest.approx(0.7, abs=0.01)
+    assert end([1.0] * 3) != pytest.approx(0.7, abs=0.01)
 
 
 def test_a_camera_that_is_not_followed_is_named():
