@@ -38,7 +38,10 @@ def sway(tmp_path_factory):
 def addon(monkeypatch):
     """The add-on as a module, with what it imports of Blender left empty."""
     bpy = ModuleType("bpy")
-    bpy.types, bpy.props = SimpleNamespace(Operator=type("Operator", (), {})), SimpleNamespace(StringProperty=lambda **_: None)
+    bpy.types, bpy.props = (
+        SimpleNamespace(Operator=type("Operator", (), {})),
+        SimpleNamespace(StringProperty=lambda **_: None),
+    )
     helper = type("ImportHelper", (), {})
     empty = {
         "bpy": bpy,
