@@ -153,7 +153,7 @@ def cells(
         discs: Those of the neighbours, shape (B, k).
         ray: Directions in the plane of each site, shape (B, rays, 2).
         open_cosine: Cosine below which a direction is open, for each number of neighbours, shape (k + 1,).
-        cluster: Distance of what counts as one, as a share of that to the last neighbour.
+        cluster: Centres closer than this share of the distance to the last neighbour count as one.
 
     Returns:
         Shapes (B,) and (B, k), bool.
