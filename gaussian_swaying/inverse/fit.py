@@ -111,9 +111,6 @@ RIVAL, MIRRORED = 1.05, 1.25
 """Cost per that of the best end below which another end may be right as well, and that of the mirrored wind, which
 differs by so little that errors of the model decide: a wrong one was lower by a tenth."""
 
-LOWER, ROUNDS = 1.02, 2
-"""Cost per that of the best end above which a fit goes on from there, and most times that it does."""
-
 DRAG = ("aero.C_D", "aero.C_F")
 """Coefficients that scale the force of the wind."""
 
@@ -157,7 +154,6 @@ class Course:
         first: The place whose simulation the first frame looks like; empty if it shows the scene at rest.
         rivals: Where other starts ended, to be compared with the end.
         matched: The place at which the current step began, and Gaussians were matched; empty before it.
-        rounds: How often it went on from another end.
         tried: Steps that the solve of the last step has tried.
         ended: The reason why it ended; empty if it did not.
         seconds: Time spent.
@@ -169,7 +165,6 @@ class Course:
     first: list[float] = field(default_factory=list)
     rivals: list[list[float]] = field(default_factory=list)
     matched: list[float] = field(default_factory=list)
-    rounds: int = 0
     tried: int = 0
     ended: str = ""
     history: list[dict[str, Any]] = field(default_factory=list)
@@ -395,31 +390,28 @@ class Problem:
                 ends, kept = [*ends, end], [*kept, cost]
         return ends, kept
 
-    def others(
-        self, place: Sequence[float], rivals: Sequence[Sequence[float]]
-    ) -> tuple[list[dict[str, float]], list[float]]:
-        """Values of other ends that cost as little as the best one, and the best place if it is clearly better.
+    def others(self, place: Sequence[float], rivals: Sequence[Sequence[float]]) -> list[dict[str, float]]:
+        """Values of other ends that cost as little as the best one over all fitted frames, or less.
 
-        Other starts, and the mirrored wind, are tried over all fitted frames.
+        Other starts, and the mirrored wind, are tried.
         """
         model, unknowns = self.simulation.model, self.plan.unknowns
         tried = [*map(list, rivals), *mirrored_place(model, unknowns, place)]
         if not tried:
-            return [], []
+            return []
         try:
             evidence = None if self.moving else self.trusted(self.evidence(), place)
             ended, costs = self._brief([list(place), *tried], evidence, self.fitted)
         except DivergedError:
-            return [], []
+            return []
         for end, cost in zip(ended, costs, strict=True):
             self.say(f"rival: cost {cost:.5g}, {self._shown(end)}")
-        away = [apart_by(unknowns, end, place) for end in ended]
-        better = ended[0] if costs[away.index(min(away))] > LOWER * costs[0] and away[0] > 2 * SAME else []
         near = []
-        for end, cost, far in zip(ended, costs, away, strict=True):
+        for end, cost in zip(ended, costs, strict=True):
             most = MIRRORED if is_mirrored(model, unknowns, place, end) else RIVAL
-            near += [self.values(end)] if cost < most * costs[0] and far > 2 * SAME else []
-        return near, better
+            if cost < most * costs[0] and apart_by(unknowns, end, place) > 2 * SAME:
+                near.append(self.values(end))
+        return near
 
     def expected(self) -> str:
         """What the fit will take, in words, from the time of one simulation; and a coarser grid if that is long."""
@@ -465,20 +457,7 @@ class Problem:
             self._check_apart(course.place)
             course.step = 0
             kept()
-        while True:
-            evidence = self._stepped(course, kept)
-            others, better = self.others(course.place, course.rivals)
-            if not better or course.rounds == ROUNDS:
-                break
-            self.say(f"another start fits better, so the fit goes on from there: {self._shown(better)}")
-            course.rivals, course.place, course.rounds = [*course.rivals, course.place], better, course.rounds + 1
-            if self.moving:
-                self.begin_at(better)
-                course.first = list(better)
-            course.step, course.matched = STEPS.index(1.0), []
-            course.tried, course.ended = 0, ""
-            kept()
-        result = self.result(course, evidence, films, others)
+        result = self.result(course, self._stepped(course, kept), films)
         return replace(result, seconds=time.monotonic() - clock)
 
     def _stepped(self, course: Course, kept: Callable[[], None]) -> list[Evidence]:
@@ -502,10 +481,8 @@ class Problem:
             kept()
         return evidence
 
-    def result(
-        self, course: Course, evidence: Sequence[Evidence], films: Path | None, rivals: Sequence[Mapping[str, float]]
-    ) -> Fit:
-        """The result of a course that has ended, with the evidence of its last stage, and other answers."""
+    def result(self, course: Course, evidence: Sequence[Evidence], films: Path | None) -> Fit:
+        """The result of a course that has ended, with the evidence of its last step."""
         place, values = torch.tensor(course.place, dtype=torch.float64), self.values(course.place)
         normal = linearised(self.residuals(evidence, self.fitted), place)
         runs = states_of(self.simulation, [values], self.times, alike=False)
@@ -523,7 +500,7 @@ class Problem:
             consequences(self.plan.assumed, values, self.simulation),
             wind_seen(values, self.videos, self.simulation),
             self.judged,
-            rivals,
+            self.others(course.place, course.rivals),
         )
 
     def grid_covariance(self, place: Tensor, evidence: Sequence[Evidence]) -> Tensor:
