@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import torch
 from loky import ProcessPoolExecutor
@@ -36,7 +36,7 @@ from gaussian_swaying.runs.signals import stop_signals
 from gaussian_swaying.simulation.measure import SimulationDiverged
 from gaussian_swaying.simulation.model import POLAR, find, number
 from gaussian_swaying.simulation.simulation import Simulation, run_batch
-from gaussian_swaying.sweeps.dataset import PICTURES, write_contact_sheets
+from gaussian_swaying.sweeps.dataset import write_contact_sheets
 from gaussian_swaying.sweeps.plan import Plan, parse_run
 from gaussian_swaying.sweeps.record import (
     LOGS,
@@ -65,13 +65,8 @@ class Job:
     """A run to do, or several of equal shape that are simulated together.
 
     Args:
-        folder: Folder of the sweep.
-        names: Names of the runs.
         config: Configuration that all runs share, as YAML.
-        frames: Frames.
         runs: The value of every axis in each run.
-        device: Device of the simulation.
-        attempt: 1 for the first time.
         resume: Continue from the checkpoint of an earlier attempt, if there is one; not if there are several runs.
         complete: Names of runs that are done already, and only simulated along with the others.
     """
@@ -98,10 +93,9 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The outcome of a job.
+    """The result of each run of a job by name.
 
     Attributes:
-        results: The result of each of its runs, by name.
         killed: Whether its process was killed, so that the reason may be outside of it.
         ready: Whether its process can do another job. It should not after lack of memory, a bug or a signal.
     """
@@ -245,37 +239,12 @@ def members_of(job: Job) -> list[Simulation]:
 
 
 # ---- processes
-class Pool(Protocol):
-    """Does jobs, several at a time. It knows nothing of plans, retries and tables.
-
-    Attributes:
-        workers: Jobs at a time.
-    """
-
-    workers: int
-
-    def submit(self, job: Job) -> Future[Outcome]:
-        """Begin a job."""
-
-    def outcome(self, job: Job, future: Future[Outcome]) -> Outcome:
-        """The outcome of a job that has ended, however it ended."""
-
-    def stop(self) -> None:
-        """Let all jobs end in order, at a frame."""
-
-    def close(self) -> None:
-        """Release all resources; no more jobs follow."""
-
-
 class Processes:
-    """A :class:`Pool` of loky's processes on this machine.
+    """Does jobs in loky's processes on this machine, several at a time; it knows nothing of plans, retries and tables.
 
     Each has an executor of its own: loky ends all processes of an executor if one of them is killed.
 
     Args:
-        workers: Processes at a time.
-        threads: Threads of torch in each.
-        explain: Makes a sentence of an error; a function of a module, as it is called in the workers.
         gpus: The GPUs as in ``CUDA_VISIBLE_DEVICES``; the workers take them in turn.
     """
 
@@ -286,7 +255,7 @@ class Processes:
         self._places: dict[Future[Outcome], int] = {}
 
     def submit(self, job: Job) -> Future[Outcome]:
-        """See ``Pool.submit``."""
+        """Begin a job."""
         place = self._free.pop(0)
         if place not in self._executors:
             environment = {"OMP_NUM_THREADS": str(self.threads), "GOMP_SPINCOUNT": os.getenv("GOMP_SPINCOUNT", "3000")}
@@ -303,7 +272,7 @@ class Processes:
         return future
 
     def outcome(self, job: Job, future: Future[Outcome]) -> Outcome:
-        """See ``Pool.outcome``."""
+        """The outcome of a job that has ended, however it ended."""
         place = self._places.pop(future)
         self._free.insert(0, place)
         try:
@@ -320,12 +289,11 @@ class Processes:
         return outcome
 
     def close(self) -> None:
-        """See ``Pool.close``."""
         for executor in self._executors.values():
             executor.shutdown()
 
     def stop(self) -> None:
-        """See ``Pool.stop``; an impatient second Ctrl-C kills them."""
+        """Let all jobs end in order, at a frame; an impatient second Ctrl-C kills them."""
         try:
             for executor in self._executors.values():
                 for process in list(executor._processes.values()):
@@ -363,7 +331,7 @@ def _without_ctrl_c() -> Iterator[None]:
 
 
 class Ray:
-    """A :class:`Pool` of Ray tasks; Ray places them and shows them.
+    """Does jobs as Ray tasks, as :class:`Processes` does.
 
     All machines must have this package, and see the folder of the sweep and the splats under the same paths.
 
@@ -371,11 +339,7 @@ class Ray:
         address: Of a cluster, as for ``ray.init``; ``local`` starts Ray on this machine.
         workers: Jobs at a time; as many as the cluster has room for if None.
         threads: Threads of each job, which Ray counts as CPUs.
-        explain: Makes a sentence of an error; a function of a module.
         gpu: The share of a GPU that a job takes.
-
-    Raises:
-        ValueError: If there is no cluster at the address.
     """
 
     def __init__(
@@ -399,14 +363,12 @@ class Ray:
         self._references: dict[Future[Outcome], Any] = {}
 
     def submit(self, job: Job) -> Future[Outcome]:
-        """See ``Pool.submit``."""
         reference = self._task.options(name=f"run {job.names[0]}", **self._options).remote(job, *self._given)
         future: Future[Outcome] = reference.future()
         self._references[future] = reference
         return future
 
     def outcome(self, job: Job, future: Future[Outcome]) -> Outcome:
-        """See ``Pool.outcome``."""
         del self._references[future]
         try:
             return future.result()
@@ -415,7 +377,6 @@ class Ray:
             return _lost(job, f"Ray ended its process ({told}): use fewer `--workers` if it was memory, or --resume.")
 
     def stop(self) -> None:
-        """See ``Pool.stop``."""
         try:
             for reference in self._references.values():
                 self._ray.cancel(reference)
@@ -424,7 +385,6 @@ class Ray:
             self.close()
 
     def close(self) -> None:
-        """See ``Pool.close``."""
         if self._ours:
             self._ray.shutdown()
 
@@ -441,7 +401,9 @@ def _task(job: Job, threads: int, explain: Explain, folder: str, path: list[str]
 
 
 # ---- all jobs
-def drive(jobs: Sequence[Job], pool: Pool, ended: Callable[[str, dict[str, Any]], None], retries: int = 1) -> None:
+def drive(
+    jobs: Sequence[Job], pool: Processes | Ray, ended: Callable[[str, dict[str, Any]], None], retries: int = 1
+) -> None:
     """Run jobs: a failed one is tried again, and one that fails too often does not stop the rest.
 
     A job of several runs that fails is done again run by run. If this is interrupted (Ctrl-C, or an exception of a
@@ -492,23 +454,19 @@ def run_sweep(
     threads: int | None = None,
     retries: int = 1,
     device: str = "auto",
-    picture: str = "last",
     explain: Explain = first_line,
     progress: bool = True,
-    started: Callable[[], None] = lambda: None,
     together: int = 1,
-    per_gpu: int = 1,
     ray: str | None = None,
     parquet: bool = False,
 ) -> dict[str, dict[str, Any]]:
     """Do all runs of a sweep that are not complete yet.
 
     Args:
-        workers: Runs at a time; None for ``per_gpu`` on each GPU, or one on each core.
+        workers: Runs at a time; None for one on each GPU, or core.
         threads: Threads of each; None for its share of the cores.
         retries: Number of times that a failed run is tried again; three times as often if its process was killed.
         device: ``auto``, ``cpu`` or ``cuda``, for every run.
-        picture: Frame of the contact sheet, ``last`` or ``middle``.
         explain: Makes a sentence of an error of a run; a function of a module.
         progress: Show a bar of runs, and a line for each failure.
         together: Largest number of runs of equal shape that are simulated together, as one job.
@@ -518,9 +476,8 @@ def run_sweep(
         The result of every run by name, as in ``results/``.
     """
     folder = Path(output).absolute()
-    check_choice("picture", picture, PICTURES)
     check_choice("device", device, ("auto", "cpu", "cuda"))
-    for name, count in (("workers", workers), ("threads", threads), ("together", together), ("per_gpu", per_gpu)):
+    for name, count in (("workers", workers), ("threads", threads), ("together", together)):
         if count is not None:
             check_whole(name, count, 1)
     check_whole("retries", retries, 0)
@@ -530,7 +487,6 @@ def run_sweep(
         check_extra("parquet", "pyarrow", "parquet")
     lock = open_folder(folder, plan, resume, together)
     try:
-        started()
         results = {name: result for name in plan.names if (result := read_result(folder, name)) is not None}
         done = frozenset(name for name, result in results.items() if result["status"] == "complete")
         jobs = []
@@ -550,13 +506,13 @@ def run_sweep(
                     tqdm.write(f"run {name} {result['status']}: {result['reason']}", file=sys.stderr)
             bar.update()
 
+        gpus = gpus_for(device)
         try:
             if jobs and ray is not None:
-                share = 1 / per_gpu if device == "cuda" or gpus_for(device) else 0.0
+                share = min(1.0, len(gpus) / (workers or 1)) or float(device == "cuda")
                 drive(jobs, Ray(ray, workers, threads or 1, explain, share), ended, retries)
             elif jobs:
-                gpus = gpus_for(device)
-                workers = workers or len(gpus) * per_gpu or cores()
+                workers = workers or len(gpus) or cores()
                 threads = threads or max(1, cores() // min(workers, len(jobs)))
                 drive(jobs, Processes(workers, threads, explain, gpus), ended, retries)
         finally:
@@ -565,7 +521,7 @@ def run_sweep(
                 if (result := read_result(folder, name)) is not None:
                     results[name] = result
             write_tables(folder, plan, results, parquet)
-        write_contact_sheets(folder, picture)
+        write_contact_sheets(folder)
         return results
     finally:
         lock.release()
