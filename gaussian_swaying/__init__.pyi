@@ -8,6 +8,7 @@ from .gaussians.formats import export_cloud as export_cloud
 from .gaussians.formats import read_gaussians as read_gaussians
 from .gaussians.model import GaussianSurfaceModel as GaussianSurfaceModel
 from .gaussians.ply import write_ply as write_ply
+from .gaussians.skin import SplatSkin as SplatSkin
 from .geometry.regions import Box as Box
 from .geometry.regions import Cylinder as Cylinder
 from .geometry.regions import Sphere as Sphere

@@ -10,8 +10,8 @@ FOLDER = Path(__file__).parents[2] / "examples"
 EXAMPLES = sorted(FOLDER.glob("*/*.py"))
 
 
-def test_there_are_thirty_of_at_most_forty_lines_each_with_a_check_and_on_the_page():
-    assert len(EXAMPLES) == 30
+def test_there_are_thirty_and_more_of_at_most_forty_lines_each_with_a_check_and_on_the_page():
+    assert len(EXAMPLES) >= 30
     page = (FOLDER.parent / "docs/examples.md").read_text(encoding="utf-8")
     for path in EXAMPLES:
         text = path.read_text(encoding="utf-8")
@@ -22,8 +22,9 @@ def test_there_are_thirty_of_at_most_forty_lines_each_with_a_check_and_on_the_pa
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_an_example_runs_to_its_check(path, tmp_path, monkeypatch):
-    if path.stem == "sweep_to_dataset":
-        pytest.importorskip("webdataset")
+    needed = {"sweep_to_dataset": "webdataset", "newton_cloth": "newton", "blender_mesh": "bpy"}
+    if path.stem in needed:
+        pytest.importorskip(needed[path.stem])
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.argv", [str(path)])
     monkeypatch.syspath_prepend(str(path.parent))

@@ -37,6 +37,7 @@ from gaussian_swaying import (
     Simulation,
     SineSway,
     Sphere,
+    SplatSkin,
     UniformGust,
     WindField,
     WindForce,
@@ -77,6 +78,7 @@ GIVEN = [
     (SimFrame.fit, {"points": torch.eye(3)}),
     (MaterialPoints.create, POINTS),
     (GaussianSurfaceModel, {"cloud": CLOUD}),
+    (SplatSkin, {"gaussians": CLOUD, "points": torch.eye(3)}),
     (WindForce, PATCH),
     (Simulation, {"scene": FLAG, "device": "cpu"}),
 ]

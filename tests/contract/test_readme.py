@@ -17,6 +17,7 @@ PAGES = {
     "README.md": ["simulation"],
     "docs/components.md": ["load", "surface", "solver", "aero", "shading", "gradient"],
     "docs/forces.md": ["vortex", "buoyancy", "spatial wind"],
+    "docs/other_engines.md": ["skin"],
     "docs/python.md": ["three lines", "by hand", "wind", "numbers", "forces"],
 }
 TEXTS = {page: (ROOT / page).read_text() for page in PAGES}
