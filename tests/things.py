@@ -153,6 +153,24 @@ def tuft():
     return painted(torch.stack([out * angle.cos(), out * angle.sin(), 0.5 * share], -1), GREEN, (-6.0, -6.0, -3.5))
 
 
+def washing_line(posts=(0.0, 2.0)):
+    """A towel on a line of 2 m between posts of 1.8 m with feet and arms: what moves, and all."""
+    draw = torch.Generator().manual_seed(0)
+
+    def box(count, low, high):
+        low, high = torch.tensor(low), torch.tensor(high)
+        return low + (high - low) * torch.rand(count, 3, generator=draw)
+
+    towel = box(6000, [0.6, -0.005, 0.6], [1.4, 0.005, 1.65])
+    line = box(400, [0.0, -0.005, 1.65], [2.0, 0.005, 1.67])
+    rest = []
+    for x in posts:
+        rest.append(box(900, [x - 0.03, -0.03, 0.0], [x + 0.03, 0.03, 1.8]))
+        rest.append(box(200, [x - 0.15, -0.15, 0.0], [x + 0.15, 0.15, 0.05]))  # foot
+        rest.append(box(200, [x - 0.03, -0.3, 1.75], [x + 0.03, 0.3, 1.8]))  # arm
+    return torch.cat([towel, line]), torch.cat([towel, line, *rest])
+
+
 def sign(width=0.03):
     """A round plate of 0.6 m on a post of 1.5 m."""
     draw = torch.Generator().manual_seed(0)

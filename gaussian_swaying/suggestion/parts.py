@@ -1,8 +1,9 @@
-"""The parts of plants in pots, flags on poles, trees and hanging things, by shape and colour."""
+"""The parts of plants in pots, flags on poles, washing lines, trees and hanging things, by shape and colour."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 import numpy as np
 import torch
@@ -37,16 +38,19 @@ WALL, SAUCER = 0.88, 1.25  # radii from the axis between which the wall lies, as
 OPENING, INSIDE = 0.7, 0.4  # part of the radius in which soil is looked for, and share of its cells that must have some
 LEVEL = 0.015  # of the height: how far above its plane soil may lie
 NEIGHBOURS = 12  # whose most frequent label a Gaussian near the pot gets
+RIM, POT_GREEN = (0.25, 0.8), 0.15  # height of the rim of a pot known by colour alone; green share of what is below it
 # of stems
 CELL, NEAR = 0.006, 0.03  # of the height: cells in which shapes are looked at, and how far around
 SEEN = 8  # cells around that show a shape
 THIN, LONG, THREAD = 0.25, 0.5, 0.12  # third over second variance of the places around, and second over first (twice)
 HAZE, TOUCHES = 0.1, 2.0  # opacity below which a Gaussian lies on what it touches; standard deviations that it reaches
-# of poles
+# of poles and posts
 SLIM, BARE = 0.04, 0.08  # width of a pole, as a share of the height; share of the slices in which it is alone
 CLOTH = 0.3  # width of a slice with cloth, as a share of the widest
 OUTSIDE = 0.02  # share of the Gaussians of a flag that may lie on the other side of its pole
 RIPPLED = 0.35  # depth of a flag over its length, seen from above
+COLUMNS, LEVELS = 50, 20  # in which the posts of a washing line are looked for
+THICK, ARM, HEM = 0.12, 0.1, 0.05  # width of a post and of its foot and arms beside it; height of the hem, as shares
 # of trees and what hangs
 FOOT = 5  # slices in which the ground around a trunk may be wide
 TRUNK, CROWN = 0.12, 0.5  # height of a bare trunk, as a share of that of the tree; green share of what is above
@@ -311,7 +315,21 @@ def woody(points: Array, green: Array, size: float) -> Array:
     return stem[of_point]
 
 
-# ---- flags, what hangs, trees
+def pot_by_colour(own: Gaussians, up: Array) -> Labels | None:
+    """A plant in a pot by colour alone: the lower part is not green and as wide as the plant; the pot is held."""
+    which = slices_of(own.means @ up, SLICES)
+    leafy, _ = green_shares(own, which)
+    wide = [breadth(own.means[which == k], up, 0.05) for k in range(SLICES)]
+    rim = next((k for k in range(SLICES) if leafy[k] > 0.5), SLICES)
+    if not RIM[0] * SLICES <= rim < RIM[1] * SLICES or leafy[:rim].sum() > POT_GREEN * rim:
+        return None
+    if min(wide[:rim]) < 0.4 * max(wide) or leafy[rim:].sum() < 0.5 * (SLICES - rim):
+        return None
+    reason = f"not green and as wide as the rest up to {rim / SLICES:.2f} of the height, and green above"
+    return (which >= rim).astype(int), [Part("pot", "held"), Part("leaf")], reason
+
+
+# ---- flags, washing lines, what hangs, trees
 
 
 def _along_sheet(means: Array, up: Array) -> Array | None:
@@ -367,6 +385,38 @@ def flag_on_pole(own: Gaussians, up: Array) -> Support | None:
     parts, toward_pole = [Part("cloth"), Part("pole", "still")], tuple((-toward * aside).tolist())
     held = Guess("side", toward_pole, "high", (f"a flag on its pole: {reason}",))
     return ((~cloth).astype(int), parts, reason), held
+
+
+def washing_line(own: Gaussians, up: Array) -> Support | None:
+    """Find the posts of a washing line: slim columns from below the hem of an upright sheet to above it.
+
+    Posts with their feet and arms are still, line and cloth are soft; None without two posts.
+    """
+    aside = _along_sheet(own.means, up)
+    if aside is None:
+        return None
+    height, along = own.means @ up, own.means @ aside
+    low, high = corners(height)
+    if high <= low or np.ptp(along) <= 0:
+        return None
+    column, level = slices_of(along, COLUMNS, 0.0), slices_of(height, LEVELS)
+    there = np.zeros((COLUMNS, LEVELS), bool)
+    there[column, level] = True
+    whole = there.mean(1) > 0.9  # from the ground to the top
+    runs = [list(run) for full, run in groupby(range(COLUMNS), lambda k: bool(whole[k])) if full]
+    if len(runs) < 2 or max(map(len, runs)) > COLUMNS * THICK:
+        return None
+    post = np.any([(column >= run[0] - 1) & (column <= run[-1] + 1) for run in runs], 0)
+    near = np.any([(column >= run[0] - ARM * COLUMNS) & (column <= run[-1] + ARM * COLUMNS) for run in runs], 0)
+    if (~near).sum() < FEWEST:
+        return None
+    hem, line = corners(height[~near], 0.01)
+    if hem < low + HEM * (high - low):
+        return None
+    label = post | (near & ((height < hem) | (height > line)))
+    reason = f"a sheet that ends above the ground between {len(runs)} slim posts"
+    held = Guess("top", tuple(up.tolist()), "high", (f"on a line: {reason}",))
+    return (label.astype(int), [Part("cloth"), Part("post", "still")], reason), held
 
 
 def swinging(own: Gaussians, up: Array, hook: Region, cell: float) -> Labels:

@@ -45,9 +45,11 @@ from gaussian_swaying.suggestion.parts import (
     AROUND,
     flag_on_pole,
     labelled,
+    pot_by_colour,
     potted_plant,
     standing,
     swinging,
+    washing_line,
 )
 from gaussian_swaying.suggestion.picture import orbit_frame, whole_box
 from gaussian_swaying.suggestion.suggestion import Suggestion
@@ -59,6 +61,7 @@ QUALITIES = {"draft": 16, "normal": 24, "fine": 48}  # cells along the longest s
 CELLS = QUALITIES["normal"]
 CLOTH_E, CLOTH_THICKNESS = 6e3, 0.01  # Pa, m; a sheet: the cloth of the paper's flags
 SHELL_E = 1e6  # Pa; of everything else, until its frequency is known
+POSTS = 2.5  # usual length of a washing line with its posts [m]
 REACH = 3  # cells that a node reaches
 ENOUGH = 0.1  # share of the Gaussians that lie beside something else, from which on nodes of their own help
 
@@ -149,10 +152,10 @@ def suggest(
     _check_extent(own.means)
     height = extent(own.means @ axis, 0.002)
     if hold is None:
-        support = potted_plant(own, axis) or flag_on_pole(own, axis)
+        support = potted_plant(own, axis) or flag_on_pole(own, axis) or washing_line(own, axis)
     parts = labelled(gaussians, simulated, height, support and support[0])
     names = [] if parts is None else parts.names
-    plant = "pot" in names
+    plant, laundry = "pot" in names, "post" in names
     if plant and upward.confidence in ("low", "medium"):
         why = (*upward.reasons, "a plant stands in a pot at the lower end")
         upward = replace(upward, confidence="high", reasons=why)
@@ -176,7 +179,7 @@ def suggest(
         held = given_hold(hold, upward.direction)
     pin = None if held.name == "none" or plant else end_region(own.means, held.direction, cell)
     if held.name == "bottom" and held.confidence in ("high", "medium") and parts is None:
-        below = standing(own, axis, max(PIN_DEPTH * size[2], 1.5 * cell))
+        below = pot_by_colour(own, axis) or standing(own, axis, max(PIN_DEPTH * size[2], 1.5 * cell))
         parts = labelled(gaussians, simulated, height, below)
         pin = pin if parts is None else None
     sheet, leaves = sheet_normal(own.means) is not None, own
@@ -186,11 +189,11 @@ def suggest(
     if kind is not None:
         name, why_kind = kind, "given"
     of = KINDS[name]
-    if name == "hanging" and held.name == "top":
+    if name == "hanging" and held.name == "top" and not laundry:
         swings = swinging(own, axis, end_region(own.means, held.direction, cell), cell)
         parts, pin = labelled(gaussians, simulated, height, swings), None
     if longest_side is None:
-        unit *= of.side
+        unit *= POSTS if laundry else of.side
     size, apart = size * unit, apart * unit
     if parts is not None and not sheet:
         parts = with_materials(parts, of, float(size[2]))

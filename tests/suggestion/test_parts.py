@@ -1,4 +1,4 @@
-"""Kinds of things and their parts: plants in pots, flags on poles, what hangs, trees and signs."""
+"""Kinds of things and their parts: plants in pots, flags on poles, washing lines, what hangs, trees and signs."""
 
 import dataclasses
 import math
@@ -25,6 +25,7 @@ from things import (
     splat,
     tube,
     tuft,
+    washing_line,
 )
 
 from gaussian_swaying.gaussians.cloud import joined
@@ -157,7 +158,7 @@ def test_a_plant_moves_in_its_pot(tmp_path):
     assert 0.5 < place.longest_side <= 1.0
 
 
-# ---- flags on poles
+# ---- flags on poles, washing lines
 
 
 @pytest.mark.parametrize("yaw", [0.0, 30.0, 200.0])
@@ -186,6 +187,7 @@ def test_a_flag_without_its_pole_or_with_two_or_on_a_rod_has_no_pole():
     for kind in ("posts", "rod", "none"):
         cloud = FlagScene(stand=kind).generate()
         assert finders.flag_on_pole(Gaussians.of(cloud), torch.tensor([0.0, 0.0, 1.0]).numpy()) is None
+        assert (guess(cloud).parts is None) == (kind != "posts")
     assert guess(FlagScene().generate()).parts is None
 
 
@@ -197,6 +199,27 @@ def test_a_flag_has_the_size_of_its_cloth_and_pole():
     size = float((cloud.means.amax(0) - cloud.means.amin(0)).amax())
     assert found.metres_per_unit == pytest.approx(1 / size, rel=1e-3)
     assert guess(cloud, up="+z", hold="-x").parts is None
+
+
+def test_posts_of_a_washing_line_stand():
+    moving, means = washing_line()
+    cloud = plain_cloud(means, -4.0, logit=2.0)
+    line = found(cloud, by=finders.washing_line)
+    assert roles(line) == [("cloth", "soft"), ("post", "still")]
+    label = line.parts.labels
+    assert (label[:6000] == 0).all()
+    assert (label[6000 : len(moving)] == 0).double().mean() > 0.8  # the line, but for its ends
+    assert (label[len(moving) :] == 1).all()
+    suggestion = guess(cloud, up="+z")
+    assert (suggestion.kind, suggestion.hold.name) == ("cloth", "top")
+    assert suggestion.metres_per_unit == pytest.approx(2.5 / 2.3, rel=0.05)  # with the feet
+
+
+def test_a_sheet_without_two_posts_has_none():
+    moving, one = washing_line((0.0,))
+    curtain = moving * torch.tensor([1.0, 1.0, 2.0])  # down to the ground
+    for means in (moving, one, curtain):
+        assert found(plain_cloud(means, -4.0, logit=2.0), by=finders.washing_line) is None
 
 
 # ---- what hangs or stands
