@@ -183,44 +183,15 @@ def compare_run(
 
 
 def table(result: dict[str, Any]) -> str:
-    """The numbers of :func:`compare_run` as Markdown that is also readable as plain text."""
+    """The numbers of :func:`compare_run` as Markdown that is also readable as plain text; None is infinite."""
     mean, worst = result["mean"], result["worst"]
-    rows: list[tuple[str, str, str]] = []
-    if "psnr_db" in mean:
-        rows.append(("PSNR [dB]", _number(mean["psnr_db"], ".2f"), _number(worst["psnr_db"], ".2f")))
-        rows.append(("PSNR of the mean square [dB]", _number(result["psnr_of_mean_db"], ".2f"), ""))
-        rows.append(("SSIM", _number(mean["ssim"], ".4f"), _number(worst["ssim"], ".4f")))
-    if "chamfer_m" in mean:
-        side = result["side_m"]
-        for label, name in (
-            ("Chamfer distance, average of both directions", "chamfer_m"),
-            ("run to reference", "run_to_reference_m"),
-            ("reference to run", "reference_to_run_m"),
-        ):
-            rows.append((f"{label} [mm]", _number(1e3 * mean[name], ".2f"), _number(1e3 * worst[name], ".2f")))
-            if side and name == "chamfer_m":
-                shares = [_number(1e2 * value[name] / side, ".2f") for value in (mean, worst)]
-                rows.append((f"the same / longer side of {side:g} m [%]", shares[0], shares[1]))
-        rows.append(("of two random samples of the reference [mm]", _number(1e3 * result["sampling_m"], ".2f"), ""))
-    header = ("", f"mean of {result['frames']} frames", "worst frame")
-    widths = [max(len(row[column]) for row in (header, *rows)) for column in range(3)]
-    lines = [_line(header, widths), f"|{'-' * (widths[0] + 2)}|{'-' * (widths[1] + 1)}:|{'-' * (widths[2] + 1)}:|"]
-    lines += [_line(row, widths) for row in rows]
-    lines += ["", f"Run `{result['run']}`, reference `{result['reference']}`: frame 0 of the run belongs to frame "]
-    lines[-1] += f"{result['reference_offset']} of the reference."
-    if result["size"]:
-        lines += [f"Pictures of {result['size'][0]} x {result['size'][1]} pixels."]
-    if "chamfer_m" in mean:
-        lines += [
-            f"Surfaces: {result['reference_points']} points of the reference, {result['run_points']} of "
-            f"{result['particles']} particles of the run, seed {result['seed']}."
-        ]
-        if not result["side_m"]:
-            lines += ["The longer side is not known, so distances are not given as shares of it: set it with --side."]
-    lines += [f"Not compared: {reason}." for reason in result["skipped"]]
-    software = ", ".join(f"{name} {number}" for name, number in result["versions"].items())
-    lines += [f"Computed on {result['device']}; {software}."]
-    return "\n".join(lines) + "\n"
+    width = max(map(len, mean))
+    lines = [f"| {'':{width}} |        mean | worst frame |", f"|{'-' * (width + 2)}|------------:|------------:|"]
+    for name in mean:
+        cells = ("infinite" if value is None else f"{value:.5g}" for value in (mean[name], worst[name]))
+        lines.append(f"| {name:{width}} | {' | '.join(f'{cell:>11}' for cell in cells)} |")
+    told = {name: value for name, value in result.items() if name not in ("mean", "worst", "per_frame")}
+    return "\n".join([*lines, "", *(f"{name}: {value}" for name, value in told.items() if value is not None)]) + "\n"
 
 
 def evaluate(
@@ -392,11 +363,3 @@ def _read_frame(path: Path, device: torch.device) -> Tensor:
     if pixels.shape[-1] != 3:
         raise ValueError(f"The picture {path} has transparent pixels: render it over its background.")
     return pixels.to(device).float() / 255
-
-
-def _number(value: float | None, form: str) -> str:
-    return "infinite" if value is None else format(value, form)
-
-
-def _line(cells: Sequence[str], widths: Sequence[int]) -> str:
-    return f"| {cells[0]:<{widths[0]}} | {cells[1]:>{widths[1]}} | {cells[2]:>{widths[2]}} |"

@@ -120,6 +120,7 @@ def work(job: Job, threads: int, explain: Explain, where: str = platform.node())
     """
     torch.set_num_threads(threads)
     told = io.StringIO()
+    results, status, ready = dict[str, dict[str, Any]](), "failed", True
     try:
         with stop_signals(), redirect_stdout(told), redirect_stderr(told):
             summaries = run_alone(job) if len(job.names) == 1 else run_together(job)
@@ -128,30 +129,27 @@ def work(job: Job, threads: int, explain: Explain, where: str = platform.node())
                 write_json(result_file(job.folder, name), result)
         return Outcome(results)
     except KeyboardInterrupt as stop:
-        return _failed(job, "failed", f"It was stopped ({stop or 'Ctrl-C'}).", ready=False)
+        reason, ready = f"It was stopped ({stop or 'Ctrl-C'}).", False
     except SimulationDiverged as error:
-        return _failed(job, "diverged", first_line(error))
+        reason, status = first_line(error), "diverged"
     except Exception as error:
         told.write(traceback.format_exc())
-        return _failed(job, "failed", explain(error), ready=isinstance(error, ValueError))
+        reason, ready = explain(error), isinstance(error, ValueError)
     finally:
         gc.collect()
         with suppress(OSError):
             if told.getvalue():
                 with (job.folder / LOGS / f"{job.names[0]}.txt").open("a", encoding="utf-8") as file:
                     file.write(told.getvalue())
-
-
-def _failed(job: Job, status: str, reason: str, **how: bool) -> Outcome:
-    return Outcome({name: failure(status, reason, job.attempt) for name in job.wanted}, **how)
+    return Outcome({name: failure(status, reason, job.attempt) for name in job.wanted}, ready=ready)
 
 
 def _lost(job: Job, reason: str) -> Outcome:
     """The outcome of a job whose process was killed, maybe after its last step."""
-    written = {name: result for name in job.wanted if (result := read_result(job.folder, name)) is not None}
+    lost = {name: failure("failed", reason, job.attempt) for name in job.wanted}
+    written = {name: read_result(job.folder, name) or {"status": "none"} for name in job.wanted}
     done = {name: result for name, result in written.items() if result["status"] == "complete"}
-    lost = _failed(job, "failed", reason, killed=True, ready=False)
-    return replace(lost, results=lost.results | done)
+    return Outcome(lost | done, killed=True, ready=False)
 
 
 def _unlocked(do: Callable[[], Any]) -> Any:
