@@ -45,6 +45,7 @@ GONE = {
     "fit.starts": "nothing: three starts go on",
     "fit.seed": "nothing: the search is always the same",
     "PhysGaussianCamera": "OrbitCamera, or another camera",
+    "DepthNormalLoss": "MultiViewGeometricLoss",
     "AnisotropyLoss.ratio": "the default, the paper's",
     "PhotometricLoss.padding": "the default, windows inside the picture",
     "DefaultDensification.reset_opacity": "nothing, as no recipe did it",
