@@ -28,8 +28,6 @@ def check_shape(name: str, tensor: Tensor, *shape: int | str | None, batches: bo
     """Check the trailing dimensions of a tensor.
 
     Args:
-        name: Name of the argument, for the message.
-        tensor: Tensor to check.
         shape: Expected trailing sizes; a letter or None stands for any size.
     """
     if not isinstance(tensor, Tensor):
@@ -49,7 +47,7 @@ def requires_grad(value: Any) -> bool:
 
 
 def check_plain(name: str, value: Any) -> None:
-    """Raise ValueError if a value that becomes plain numbers, or one of its items, requires a gradient."""
+    """Raise ValueError if a value that becomes plain numbers, or an item of it, requires a gradient."""
     items = value if isinstance(value, Iterable) and not isinstance(value, Tensor | str | bytes) else [value]
     if any(map(requires_grad, items)):
         raise ValueError(
@@ -82,7 +80,7 @@ def check_vector(name: str, value: Any, length: int = 3) -> tuple[float, ...]:
 
 
 def check_sense(name: str, value: float, least: float = 1e-12) -> None:
-    """Raise ValueError unless a finite number lies in the range in which a setting of its name makes sense."""
+    """Raise ValueError unless a finite number lies in the sensible range of the setting of that name."""
     sense = sense_of(name)
     known = sense or Sense(low=least)
     if value and not known.low <= (value if sense else abs(value)) <= known.high:
@@ -148,13 +146,7 @@ def check_finite(name: str, tensor: Tensor) -> None:
 
 
 def check_like(name: str, tensor: Tensor, like: Tensor) -> None:
-    """Check that a tensor has the precision and lies on the device of the material.
-
-    Args:
-        name: Name of the argument, for the message.
-        tensor: Tensor to check.
-        like: A tensor of the material.
-    """
+    """Check that a tensor has the precision and lies on the device of the material."""
     if tensor.dtype != like.dtype:
         found, wanted = (str(dtype).removeprefix("torch.") for dtype in (tensor.dtype, like.dtype))
         raise TypeError(f"Expected `{name}` in {wanted}, as the material is, but got {found}: convert it with `.to`.")

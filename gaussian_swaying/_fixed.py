@@ -26,7 +26,7 @@ _changes = count(1)
 
 
 def count_change(thing: Any) -> None:
-    """Mark an object as changed, so that what was recorded of it is recorded again."""
+    """Count a change of an object, so that recordings of it become invalid."""
     vars(thing)["_changed"] = next(_changes)
 
 
@@ -50,7 +50,6 @@ class Fixed:
                 setattr(cls, name, _closing(name, vars(cls)[name]))
 
     def __post_init__(self) -> None:
-        """Close a dataclass."""
         _close(self, "__post_init__", Fixed.__post_init__)
 
     def __repr__(self) -> str:
@@ -93,7 +92,6 @@ def fixed(kind: type[T]) -> type[T]:
 
 
 def _closing(name: str, method: Callable[..., None]) -> Callable[..., None]:
-    """An ``__init__`` or ``__post_init__`` after which an object is made, unless it belongs to a base of its class."""
     parameters, ours = inspect.signature(method), (method.__module__ or "").startswith("gaussian_swaying.")
 
     @wraps(method)
@@ -146,20 +144,19 @@ def _refuses(thing: Any, name: str) -> bool:
 
 
 def _check(thing: Any, name: str, *value: object) -> None:
-    """Refuse a value, unless it is there, as after an operation in place; or that the name is deleted."""
     fresh = not value or isinstance(getattr(type(thing), name, None), property)
     if _refuses(thing, name) and (fresh or getattr(thing, name, _ABSENT) is not value[0]):
         _refuse(thing, name)
 
 
 def fields_of(kind: type) -> list[str]:
-    """The arguments of the constructor of a class, or for a user's own class of that of the package below it."""
+    """Constructor arguments of a class; for a user's class, those of its base in the package."""
     ours = next(c for c in kind.__mro__ if _ours(c) or c is object)
     return list(inspect.signature(ours.__init__).parameters)[1:]  # type: ignore[misc]
 
 
 def described(thing: Any) -> str:
-    """The class of an object, and those of its arguments that are not the default."""
+    """Class name and non-default arguments of an object."""
     shown = []
     for name, argument in inspect.signature(type(thing).__init__).parameters.items():
         text = _brief(getattr(thing, name, None))
@@ -191,7 +188,7 @@ def _refuse(thing: Any, name: str) -> NoReturn:
 
 
 def assign(thing: Any, **values: Any) -> None:
-    """Assign to a fixed object, for the code that answers for it."""
+    """Set attributes of a fixed object. The caller must keep everything that depends on them consistent."""
     made = getattr(thing, "__dict__", {}).pop("_made", None)
     try:
         for name, value in values.items():
@@ -203,7 +200,7 @@ def assign(thing: Any, **values: Any) -> None:
 
 
 def changed(thing: T, **values: Any) -> T:
-    """A copy with other attributes; its other parts are shared. Numbers replace the content of a buffer."""
+    """A copy with other attributes that shares all other parts. A number is copied into its buffer."""
     other = copy.copy(thing)
     made = getattr(other, "__dict__", {}).pop("_made", None)  # a new object, which no recording knows
     if isinstance(thing, nn.Module):
@@ -228,11 +225,9 @@ class FixedList(Fixed, nn.ModuleList):
         super().__init__(modules)
 
     def add_module(self, name: str, module: nn.Module | None) -> None:
-        """Add a module while the list is made."""
         if "_made" in vars(self):
             _refuse(self, name)
         super().add_module(name, module)
 
     def insert(self, index: int, module: nn.Module) -> None:
-        """Refuse."""
         _refuse(self, str(index))

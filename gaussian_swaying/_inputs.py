@@ -27,7 +27,6 @@ def check_regular(path: str | os.PathLike[str], what: str = "the file", largest:
     """Return a path if it is a regular file, and not a folder, or a device or pipe that may never end.
 
     Args:
-        what: Name of the kind of file, for the message.
         largest: Largest allowed size [bytes].
     """
     path = Path(path)
@@ -53,9 +52,6 @@ def read_json(path: str | os.PathLike[str], what: str, largest: int = LARGEST_JS
     Args:
         what: Name of the file in the message, for example "camera file".
         largest: Largest allowed size [bytes].
-
-    Returns:
-        The parsed content.
     """
     try:
         content = check_regular(path, f"the {what}", largest).read_bytes()
@@ -67,17 +63,13 @@ def read_json(path: str | os.PathLike[str], what: str, largest: int = LARGEST_JS
 
 
 def decoded(content: bytes) -> str:
-    """The text of a file in UTF-8, or in UTF-16 if it begins with the mark of that, without its byte order mark."""
+    """Text of a file in UTF-8, or in UTF-16 with a byte order mark."""
     wide = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
     return content.decode("utf-16" if wide else "utf-8-sig")
 
 
 def parse_json(content: bytes, what: str, path: str | os.PathLike[str]) -> Any:
-    """Parse JSON from a file or a part of one.
-
-    Args:
-        path: The file, for the message.
-    """
+    """Parse JSON from a file or a part of one."""
     entries = sum(map(content.count, (b",", b"[", b"{")))
     if entries > MOST_ENTRIES:
         raise ValueError(
@@ -94,11 +86,7 @@ def parse_json(content: bytes, what: str, path: str | os.PathLike[str]) -> Any:
 
 
 def check_archive(path: str | os.PathLike[str], what: str) -> Path:
-    """Return a path if it is a .npz file whose arrays take no more than a gigabyte plus ten times its size.
-
-    Args:
-        what: Name of the kind of file, for the message.
-    """
+    """Return a path if it is a .npz file whose arrays take no more than a gigabyte plus ten times its size."""
     path = check_regular(path, what)
     try:
         with zipfile.ZipFile(path) as archive:
@@ -112,7 +100,7 @@ def check_archive(path: str | os.PathLike[str], what: str) -> Path:
 
 @contextmanager
 def spare_memory(amount: int) -> Iterator[None]:
-    """Let compressed files take so many bytes of memory within the block, besides a multiple of their size."""
+    """Within the block, compressed files may take this much memory [bytes] besides a multiple of their size."""
     token = _SPARE.set(amount)
     try:
         yield
@@ -142,10 +130,6 @@ def read_arrays(
 
     Args:
         what: Name of the kind of file, for the message, for example "the reference".
-        only: Whether others are an error.
-
-    Returns:
-        The arrays found, by name.
     """
     try:
         path = check_archive(path, what)

@@ -19,9 +19,6 @@ def in_threads(work: Callable[..., ResultT], *arguments: Iterable[object], threa
     """As ``map``, with the results in the order of the arguments, for any number of threads.
 
     Each thread runs the operations of torch alone, with the gradients and the inference mode of the caller.
-
-    Args:
-        arguments: Its arguments, one iterable for each.
     """
     if threads <= 1:
         yield from map(work, *arguments)

@@ -16,7 +16,7 @@ def called(command: str) -> None:
 
 
 def words(command: str) -> list[str]:
-    """The words that start a command.
+    """How a command is started.
 
     Example:
         >>> words("sim")
@@ -42,7 +42,7 @@ def name(command: str) -> str:
 
 
 def this() -> list[str]:
-    """The words that started this process."""
+    """How this process was started."""
     if _called:
         return [INSTALLED, *_called]
     program = sys.argv[0] or "python"

@@ -40,11 +40,7 @@ def check_yaml(text: str) -> str:
 
 
 def limit_yaml(change: Callable[[Any], Any]) -> None:
-    """Make jsonargparse apply :func:`check_yaml` to files and to values from the command line.
-
-    Args:
-        change: Returns what a configuration, or a value, stands for.
-    """
+    """Make jsonargparse apply :func:`check_yaml` to files and to values from the command line."""
     import yaml
     from jsonargparse import set_loader
 
@@ -66,10 +62,6 @@ def read_fields(
 
     Args:
         what: Name of the kind of file, for the message, for example "the sweep file".
-        change: Returns what was read, or refuses it.
-
-    Returns:
-        The given values, by name.
     """
     import yaml
 

@@ -33,7 +33,6 @@ class Body:
     area: float | None
 
     def __add__(self, other: Body) -> Body:
-        """Both bodies, with the area of the first."""
         return Body(
             torch.cat([self.means, other.means]),
             torch.cat([self.normals, other.normals]),
@@ -67,34 +66,29 @@ def _discs(means: Tensor, normals: Tensor, spacing: float, opacity: float, area:
 
 
 def plate(count: int = 20_000, opacity: float = 0.95, seed: int = 0, roughness: float = 0.0) -> Body:
-    """A free sheet of one square metre, at random places, off its plane by ``roughness`` spacings (rms)."""
     noise, draw = _random(count, seed)
     place = draw * torch.tensor([1.0, 1.0, 0.0]) + noise * torch.tensor([0.0, 0.0, roughness * count**-0.5])
     return _discs(place, torch.tensor([[0.0, 0.0, 1.0]]).double().expand(count, 3), count**-0.5, opacity, 1.0)
 
 
 def shell(count: int = 20_000, radius: float = 1.0, opacity: float = 0.95, seed: int = 0) -> Body:
-    """A sphere, at random places."""
     normal = torch.nn.functional.normalize(_random(count, seed)[0], dim=-1)
     area = 4 * math.pi * radius**2
     return _discs(radius * normal, normal, math.sqrt(area / count), opacity, area)
 
 
 def clutter(count: int, spacing: float, opacity: float = 0.9, radius: float = 0.9, seed: int = 1) -> Body:
-    """Discs of any direction in a ball, for the inside of another body."""
     normal, draw = _random(count, seed)
     away = torch.nn.functional.normalize(_random(count, seed + 1)[0], dim=-1) * radius * draw[:, :1] ** (1 / 3)
     return _discs(away, normal, spacing, opacity, None)
 
 
 def cluttered_sphere(count: int = 40_000, opacity: float = 0.9, radius: float = 0.9) -> Body:
-    """A sphere, and as many Gaussians of any direction in a smaller ball inside it."""
     half = count // 2
     return shell(half) + clutter(count - half, math.sqrt(4 * math.pi / half), opacity, radius)
 
 
 def two_shells(count: int = 40_000, inner: float = 0.8) -> Body:
-    """A sphere, and another one in it."""
     return shell(count // 2) + shell(count - count // 2, inner, seed=3)
 
 
@@ -117,7 +111,6 @@ def cluttered_box(count: int = 40_000) -> Body:
 
 
 def layered_skin(layers: int = 4, gap: float = 1.0, opacity: float = 0.5, count: int = 15_000) -> Body:
-    """A sphere with further layers below its surface, ``gap`` spacings apart."""
     spacing = math.sqrt(4 * math.pi / count)
     found = shell(count, 1.0, opacity)
     for layer in range(1, layers):
@@ -158,7 +151,6 @@ def leaf_ball(index: float, side: float = 0.32, across: int = 12, seed: int = 40
 
 
 def of_cloud(cloud: GaussianCloud, threshold: float = 0.1, above: float | None = None) -> Body:
-    """Gaussians of at least some opacity, those above a height if one is given, with the area of ``coverage``."""
     model = GaussianSurfaceModel.from_cloud(cloud, requires_grad=False)
     opacity = model.opacity()
     kept = opacity >= threshold

@@ -4,7 +4,6 @@ import time
 
 
 def listened(window):
-    """A window with its errors in ``problems``, them and its log in ``told``, and what it asks for in ``asked``."""
     window.told, window.problems, window.asked = [], [], []
     window.on("console", lambda message: window.told.append(message.text))
     for errors in (window.told, window.problems):
@@ -14,7 +13,6 @@ def listened(window):
 
 
 def asked_of_a_network(window):
-    """Addresses that a page asked for outside its file."""
     return [url for url in window.asked if not url.startswith(("file:", "data:", "blob:"))]
 
 
@@ -26,7 +24,6 @@ def picture_of(window, **clip):
 
 
 def until(condition, seconds=60.0):
-    """Wait until a condition holds."""
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "it did not happen"

@@ -60,12 +60,10 @@ OBSTACLES = {
 
 
 def made(kind, /, *given, **settings):
-    """A function that makes a boundary condition, with more settings on request."""
     return lambda **more: BOUNDARIES[kind](*given, **settings | more)
 
 
 def conditions(region):
-    """Conditions that are no obstacles, in and beside a region."""
     pull = {"velocity": [0.1, 0.0, 0.0], "angular_velocity": [0.0, 0.0, 1.0], "pivot": [0.1, 0.2, 0.3]}
     front = [[0.0, -0.3, 0.1], [0.0, 0.9, 0.1]]
     return {

@@ -1,5 +1,3 @@
-"""Fixtures and the rule for GPU tests."""
-
 import importlib.util
 import os
 import shutil
@@ -54,7 +52,6 @@ def node():
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 def device(request):
-    """Each device in turn."""
     return torch.device(request.param)
 
 
@@ -64,7 +61,6 @@ kernel_device = device
 
 @pytest.fixture(scope="session")
 def parser():
-    """The parser of the command line."""
     from gaussian_swaying.simulation.simulation import Simulation
 
     return Simulation.parser()
@@ -72,7 +68,6 @@ def parser():
 
 @pytest.fixture
 def use_threads():
-    """``torch.set_num_threads``, undone afterwards."""
     before = torch.get_num_threads()
     yield torch.set_num_threads
     torch.set_num_threads(before)
@@ -80,7 +75,6 @@ def use_threads():
 
 @pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])
 def dtype(request):
-    """Each supported precision in turn."""
     return request.param
 
 
@@ -100,7 +94,6 @@ def _seed():
 
 @pytest.fixture(autouse=True)
 def _not_called():
-    """Forget that a test started a command through the installed program."""
     yield
     program._called.clear()
 

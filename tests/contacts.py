@@ -90,5 +90,4 @@ def crossings(place: Tensor, triangles: Tensor) -> int:
 
 
 def _volume(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
-    """Six times the signed volume of tetrahedra."""
     return (torch.linalg.cross(b - a, c - a, dim=-1) * (d - a)).sum(-1)

@@ -19,7 +19,6 @@ class Fuse:
 
 
 def damaged(rng, content):
-    """Some bytes changed, cut out or put in, the end cut off, or all of it noise."""
     data = bytearray(content)
     if not data or rng.random() < 0.03:
         return rng.choice((b"", b"[" * 100_000, rng.randbytes(500), bytes(len(data))))
@@ -39,13 +38,11 @@ def damaged(rng, content):
 
 
 def places(node):
-    """Every container of a document with each of its keys."""
     keys = list(node) if isinstance(node, dict) else range(len(node)) if isinstance(node, list) else ()
     return [(node, key) for key in keys] + [place for key in keys for place in places(node[key])]
 
 
 def changed(rng, document):
-    """The document with some entries that are others, missing, renamed or exchanged."""
     for _ in range(rng.choice((1, 1, 2))):
         node, key = rng.choice(places(document) or [({"": 0}, "")])
         kind = rng.random()

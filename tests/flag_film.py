@@ -23,7 +23,6 @@ FLAG = (1.2, 0.8)
 
 
 def camera_of(width: int, height: int) -> Camera:
-    """The true camera."""
     return look_at_camera([1.3, -3.2, 0.5], [0.55, 0.0, 0.2], [0.0, 0.0, 1.0], FOV, width, height)
 
 

@@ -40,7 +40,6 @@ def write_base(folder: Path, wall: float = 0.02) -> Path:
 
 
 def tripod(width: int, height: int) -> Camera:
-    """The camera of the first frame, without shake."""
     return look_at_camera((0.05, -0.95, 0.35), MIDDLE, (0, 0, 1), 38.0, width, height, dtype=torch.float64)
 
 

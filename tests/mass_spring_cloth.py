@@ -58,15 +58,12 @@ class MassSpringCloth(Solver):
 
     @property
     def points(self) -> MaterialPoints:
-        """The material."""
         return self._points
 
     def like(self, settings: Settings) -> "MassSpringCloth":
-        """The same cloth with other numbers."""
         return MassSpringCloth(self.dx, settings.gravity, settings.damping, self.neighbours, list(self.boundaries))
 
     def init_state(self, points: MaterialPoints, *, frame: Any = None, surface: Any = None) -> State:
-        """Join the points; the state at rest."""
         self._points, x = points, points.position
         rest = x.reshape(-1, points.count, 3)[0]  # all scenes of a batch have the same points
         count = min(self.neighbours, points.count - 1)
@@ -110,7 +107,6 @@ class MassSpringCloth(Solver):
         return force - back, stretch
 
     def rollout(self, state: State, dt: float, steps: int, forces: Any = None) -> State:
-        """Advance by some substeps."""
         mass, acting = self.points.mass[..., None], as_forces(forces)
         gravity = state.position.new_tensor(self.gravity)
         sources = [force.during(state.time, dt, steps) for force in acting]
@@ -141,7 +137,6 @@ class MassSpringCloth(Solver):
 
 
 def flag(solver: Solver) -> Simulation:
-    """A flag that is held along one side."""
     return Simulation(
         FlagScene(spacing=0.05),
         Material(E=3e4, density=30.0, thickness=0.01),
@@ -152,7 +147,6 @@ def flag(solver: Solver) -> Simulation:
 
 
 def main(output: Path, frames: int = 25) -> float:
-    """Record the flag with both solvers; returns how far apart its points end, over the way that they went."""
     pins = [PinnedRegion(Box([None, None, None], [0.06, None, None]))]
     options = {"dx": 0.1, "gravity": (0.0, 0.0, 0.0), "damping": 2.0, "boundaries": pins}
     places = []

@@ -18,7 +18,6 @@ FILES = Path(__file__).parent / "gaussians" / "files"
 
 
 def scene():
-    """The Gaussians of all files there."""
     return read_ply(FILES / "scene.ply")
 
 
@@ -60,13 +59,11 @@ def in_order(found, expected):
 
 
 def glb_parts(content):
-    """The document and the data of a .glb file."""
     size = struct.unpack_from("<I", content, 12)[0]
     return json.loads(content[20 : 20 + size]), content[28 + size :]
 
 
 def glb(document, data):
-    """The .glb file of a document and its data."""
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(data)) + struct.pack("<I4s", len(text), b"JSON")
@@ -74,13 +71,11 @@ def glb(document, data):
 
 
 def members(path):
-    """The files of a bundle by name."""
     with zipfile.ZipFile(path) as archive:
         return {name: archive.read(name) for name in archive.namelist()}
 
 
 def packed(path, files):
-    """A bundle of files by name, at a path, which is returned."""
     with zipfile.ZipFile(path, "w") as archive:
         for name, content in files.items():
             archive.writestr(name, content)
@@ -88,7 +83,6 @@ def packed(path, files):
 
 
 def refused(path, *words, name=None):
-    """A file is refused in one sentence that names it, or what else is given, and has the words."""
     with pytest.raises((ValueError, FileNotFoundError)) as caught:
         read_gaussians(path)
     told = str(caught.value)

@@ -72,7 +72,6 @@ def place(count: int, seed: int = 0, sh_degree: int = 3) -> tuple[GaussianCloud,
 
 
 def _plant(count: int) -> GaussianCloud:
-    """About as many Gaussians of a potted plant, z up, without its floor."""
     spacing = 0.02
     for _ in range(4):
         cloud = alocasia(spacing=spacing)

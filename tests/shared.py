@@ -32,12 +32,10 @@ SMALL = {
 
 
 def words(settings):
-    """Settings as options of a command line."""
     return [option(name, value) for name, value in settings.items()]
 
 
 def advanced(simulation, frames, state=None):
-    """The state after some frames, from rest if none is given, and the diagnostics of each."""
     state, log = simulation.start() if state is None else state, []
     for _ in range(frames):
         state, health = simulation.advance(state)
@@ -47,7 +45,6 @@ def advanced(simulation, frames, state=None):
 
 @contextmanager
 def without_waits():
-    """Raise an error where the host waits for the GPU."""
     torch.cuda.set_sync_debug_mode("error")
     try:
         yield
@@ -56,7 +53,6 @@ def without_waits():
 
 
 def waits(work):
-    """How often the host waits for the GPU in some work."""
     torch.cuda.set_sync_debug_mode("warn")
     try:
         with warnings.catch_warnings(record=True) as told:
@@ -68,7 +64,6 @@ def waits(work):
 
 
 def solid(position, volume, density=100.0, E=1e4, nu=0.3, **more):
-    """Material at some places."""
     return MaterialPoints.create(position, volume=volume, density=density, youngs_modulus=E, poisson_ratio=nu, **more)
 
 
@@ -102,7 +97,6 @@ def double(values):
 
 
 def seeded(seed):
-    """A generator of random numbers."""
     return torch.Generator().manual_seed(seed)
 
 
@@ -122,7 +116,6 @@ def unit(*shape, **options):
 
 
 def gradients(count, device="cpu", dtype=torch.float64):
-    """Deformation gradients of both orientations, none of them near singular."""
     f = EYE + 0.3 * randn(count, 3, 3)
     f = f[torch.linalg.det(f).abs() > 0.2]
     assert len(f) > 4
@@ -131,7 +124,6 @@ def gradients(count, device="cpu", dtype=torch.float64):
 
 
 def merged(settings, changes):
-    """Settings with some changed; a dictionary with a class replaces the one before."""
     both = dict(settings)
     for name, value in changes.items():
         inner = isinstance(value, dict) and "class_path" not in value and isinstance(both.get(name), dict)
@@ -163,17 +155,14 @@ def refused(main, arguments, capsys, *words, folder=None):
 
 
 def normalized(vectors):
-    """Unit vectors of the same directions, along the last axis."""
     return torch.nn.functional.normalize(vectors, dim=-1)
 
 
 def peak(values):
-    """The largest absolute value."""
     return values.abs().max()
 
 
 def longest(vectors):
-    """The largest length of vectors along the last axis."""
     return vectors.norm(dim=-1).max()
 
 
@@ -189,25 +178,20 @@ def user_warning(match):
 
 @contextmanager
 def silent():
-    """Where a warning is an error."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         yield
 
 
 def alike(found, expected, share):
-    """The two differ by no more than a share of what is expected."""
     assert_close(found, expected, rtol=share, atol=0)
 
 
 def near(found, expected, within):
-    """The two differ by no more than an absolute bound."""
     assert_close(found, expected, rtol=0, atol=within)
 
 
 def png(width, height, pixels=b""):
-    """A PNG file whose header may promise more than there is."""
-
     def chunk(name, data):
         return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
@@ -222,6 +206,5 @@ def turned_by(degrees):
 
 
 def rows(path):
-    """The rows of a table, as text by the names of columns."""
     with path.open(newline="") as file:
         return list(csv.DictReader(file))

@@ -23,7 +23,6 @@ def arc(count, width=20, height=16):
 
 
 def picture(index, width=20, height=16, channels=3):
-    """A picture that tells its index, row and column."""
     rows, columns = np.meshgrid(np.arange(height), np.arange(width), indexing="ij")
     layers = [np.full((height, width), 10 * index), rows * 8, columns * 8, 255 - rows * 5 - columns]
     return np.stack(layers[:channels], -1).astype(np.uint8)
@@ -55,7 +54,6 @@ POINTS = [((0.5, -0.25, 1.5), (255, 0, 51)), ((0.0, 0.1, 0.2), (0, 102, 255)), (
 def write_colmap(
     folder, poses, names, model="PINHOLE", parameters=None, binary=True, sparse="sparse/0", points=POINTS, images=True
 ):
-    """A COLMAP folder; the first image sees two points, the others none."""
     target = folder / sparse
     target.mkdir(parents=True, exist_ok=True)
     width, height = poses[0].width, poses[0].height

@@ -32,13 +32,11 @@ def _box(x):
 
 
 def changed(folder, **changes):
-    """The simulation of the flag, with some settings changed."""
     (folder / "made.yaml").write_text(yaml.safe_dump(base(**changes)))
     return Simulation.from_yaml(folder / "made.yaml", device="cpu")
 
 
 def cameras(width=200, height=120):
-    """Two tripods."""
     return {
         "left": look_at_camera((0.0, -0.8, 0.3), (0.2, 0.05, 0.12), (0, 0, 1), 38.0, width, height),
         "right": look_at_camera((0.65, -0.65, 0.25), (0.2, 0.05, 0.12), (0, 0, 1), 38.0, width, height),
@@ -47,7 +45,6 @@ def cameras(width=200, height=120):
 
 @pytest.fixture(scope="session")
 def own(tmp_path_factory):
-    """A folder with base.yaml and its video, with noise of two grey levels."""
     from bench.problems.films import write_video  # takes long to import
 
     folder = tmp_path_factory.mktemp("own")

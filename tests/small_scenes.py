@@ -52,7 +52,6 @@ def plain_cloud(means, log_scales=-4.0, quats=(1.0, 0.0, 0.0, 0.0), logit=3.0):
 
 
 def coloured(cloud, color, where=slice(None)):
-    """The same Gaussians, some of them with one colour from all sides."""
     sh = cloud.sh.clone()
     sh[where, 0] = (torch.tensor(color) - 0.5) / SH_DC
     return dataclasses.replace(cloud, sh=sh)
@@ -62,7 +61,6 @@ GREEN = (0.2, 0.5, 0.15)
 
 
 def block(sides, color, count=3000):
-    """The six faces of a box, seen from outside."""
     draw = torch.Generator().manual_seed(0)
     low, high = torch.zeros(3), torch.tensor(sides)
     place = low + (high - low) * torch.rand(count, 3, generator=draw)
@@ -106,7 +104,6 @@ def lamp(count=3000):
 
 
 def run_cost(dx, **numbers):
-    """A cost of a run on a grid, of which some numbers matter."""
     found = {"device": "", "particles": 1, "grid": (1, 1, 1), "frames": 51, "substeps": 1, "picture_seconds": None}
     return Cost(dx=dx, **(found | dict.fromkeys(("substep_seconds", "simulation_seconds"), 1.0) | numbers))
 
@@ -129,7 +126,6 @@ guess = partial(suggest, tune=False)
 
 
 def varied_cloud(count=300, degree=1, seed=0, normals=False):
-    """Gaussians of all colours, sizes, opacities and rotations."""
     draw = torch.Generator().manual_seed(seed)
 
     def random(*shape):
@@ -146,7 +142,6 @@ def varied_cloud(count=300, degree=1, seed=0, normals=False):
 
 
 def turned_cloud(cloud, quat):
-    """A splat turned about the origin by a unit quaternion wxyz; its harmonics stay."""
     w, x, y, z = quat
     a, b, c, d = cloud.quats.unbind(-1)
     quats = torch.stack(
@@ -156,14 +151,12 @@ def turned_cloud(cloud, quat):
 
 
 def together(*clouds):
-    """Several splats as one."""
     names = ("means", "quats", "scales", "opacities", "sh")
     return GaussianCloud(*(torch.cat([getattr(cloud, name) for cloud in clouds]) for name in names))
 
 
 @pytest.fixture
 def make_cloud():
-    """A random splat in the unit cube."""
     return _make_cloud
 
 

@@ -1,5 +1,3 @@
-"""Files that are refused before they are read."""
-
 import os
 import struct
 import zipfile
@@ -67,7 +65,6 @@ def test_good_json(encoding, tmp_path):
 
 
 def test_an_archive_that_swells_is_refused(tmp_path):
-    """Two gigabytes of zeros in two megabytes; the name of the member is enough, nothing is unpacked."""
     good, bad = tmp_path / "good.npz", tmp_path / "bad.npz"
     np.savez(good, a=np.zeros(10))
     assert check_archive(good, "the run") == good

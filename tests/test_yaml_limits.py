@@ -1,5 +1,3 @@
-"""Configurations that are too much are refused before they are built, in a sentence."""
-
 import pytest
 import yaml
 from shared import refused
@@ -9,7 +7,6 @@ from gaussian_swaying.cli.simulate import main
 
 
 def laughs(levels):
-    """Nine times nine times nine ..."""
     lines = ["a0: &a0 [lol, lol, lol, lol, lol, lol, lol, lol, lol]"]
     lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, levels)]
     return "\n".join(lines)

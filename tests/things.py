@@ -22,7 +22,6 @@ def draws(*shape, seed=0):
 
 
 def tube(low, high, radius, count=600, end=None, seed=0):
-    """Points on a tube between two points, its radius ``end`` at the upper one, with both caps."""
     draw = torch.Generator().manual_seed(seed)
     low, high = torch.tensor(low), torch.tensor(high)
     axis = torch.nn.functional.normalize(high - low, dim=0)
@@ -40,13 +39,11 @@ def tube(low, high, radius, count=600, end=None, seed=0):
 
 
 def ball(center, radius, count=600, seed=0):
-    """Points on a sphere."""
     draw = torch.Generator().manual_seed(seed)
     return torch.tensor(center) + radius * unit(count, 3, generator=draw, dtype=torch.float32)
 
 
 def block(low, high, count=1500, seed=0):
-    """Points on the six sides of a box."""
     place, side = draws(count, 3, seed=seed), torch.arange(count) % 3
     place[torch.arange(count), side] = (torch.arange(count) // 3 % 2).float()
     low, high = torch.tensor(low), torch.tensor(high)
@@ -54,7 +51,6 @@ def block(low, high, count=1500, seed=0):
 
 
 def full(low, high, count=1500, seed=0):
-    """Points in a box."""
     low, high = torch.tensor(low), torch.tensor(high)
     return low + (high - low) * draws(count, 3, seed=seed)
 
@@ -84,7 +80,6 @@ def man():
 
 
 def biker():
-    """On two wheels in the plane x-z, bent over the handlebar."""
     return [
         *(tube([x, -0.02, 0.33], [x, 0.02, 0.33], 0.33, 1500) for x in (-0.5, 0.5)),
         tube([-0.5, 0.0, 0.33], [-0.15, 0.0, 0.8], 0.03, 400),
@@ -110,7 +105,6 @@ def guitar_on_a_stand():
 
 
 def plant_in_a_pot():
-    """A pot that widens upwards, a stem and a crown; the origin somewhere else."""
     return [
         tube([0.0, 0.0, 0.0], [0.0, 0.0, 0.2], 0.1, 900, 0.14),
         tube([0.0, 0.0, 0.18], [0.0, 0.0, 0.6], 0.015, 400),
@@ -146,7 +140,6 @@ def cone():
 
 
 def tuft():
-    """Thin blades from one base."""
     blade, share = (80 * draws(6000)).long(), draws(6000, seed=1)
     angle, lean = 2 * math.pi * draws(80, seed=2)[blade], 0.15 + 0.25 * draws(80, seed=3)[blade]
     out = 0.02 + lean * share**2
@@ -199,7 +192,6 @@ def flag_on_a_pole(**settings):
 
 
 def as_captured(cloud, seed=0):
-    """As training leaves a thing: y down and tilted, of all opacities, with needles, fluff and haze."""
     draw = torch.Generator().manual_seed(seed)
 
     def normal(*shape):

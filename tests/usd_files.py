@@ -9,7 +9,6 @@ NAMES = ("positions", "orientations", "scales", "opacities", "harmonics", "color
 
 
 def read_usd_frame(path: Path, frame: int) -> dict[str, np.ndarray]:
-    """The arrays of one frame, as ``usd_arrays`` gives them; a frame without samples is interpolated."""
     from pxr import Usd, UsdGeom
 
     stage = Usd.Stage.Open(str(path))  # a prim lives as long as its stage

@@ -14,7 +14,7 @@ from gaussian_swaying.sweeps.run import run_sweep
 
 SWEEP = """
 base: {base}
-settings: {{frames: 6, scene.generator.init_args.spacing: 0.1, solver.dx: 0.2}}
+settings: {{frames: 6, scene.generator.init_args.spacing: 0.05, solver.dx: 0.2}}
 axes:
   wind.flow: [[2, -1, 0], [2, 1, 0], [4, -1, 0], [4, 1, 0]]
 """

@@ -9,7 +9,7 @@ from gaussian_swaying.scenes import FlagScene
 pole, energy = PinnedRegion(Box([None, None, None], [0.11, None, None])), []
 for rate in (0.0, 4.0):
     solver = MPMSolver(dx=0.2, boundaries=[pole], damping=rate)  # with gravity: it falls from its plane
-    simulation = Simulation(FlagScene(spacing=0.1), Material(E=3e4, density=30.0), solver=solver)
+    simulation = Simulation(FlagScene(spacing=0.05), Material(E=3e4, density=30.0), solver=solver)
     *_, frame = simulation.frames(12)
     frame.save(f"damping_{rate:g}.png")
     energy.append(frame.health.kinetic)

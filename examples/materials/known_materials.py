@@ -9,7 +9,7 @@ from gaussian_swaying.scenes import FlagScene
 
 pole, moved = Box([None, None, None], [0.11, None, None]), {}
 for name in ("silk", "cotton", "denim"):
-    simulation = Simulation(FlagScene(spacing=0.1), name, hold=pole, wind=[0, 3, 0])
+    simulation = Simulation(FlagScene(spacing=0.05), name, hold=pole, wind=[0, 3, 0])
     *_, frame = simulation.frames(8)
     frame.save(f"known_materials_{name}.png")
     moved[name] = frame.health.displacement_mean

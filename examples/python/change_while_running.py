@@ -8,7 +8,7 @@ from gaussian_swaying.scenes import FlagScene
 
 pole = Box([None, None, None], [0.11, None, None])
 cloth = Material(E=3e3, density=30.0)
-simulation = Simulation(FlagScene(spacing=0.1), cloth, hold=pole, wind=[0, 3, 0])
+simulation = Simulation(FlagScene(spacing=0.05), cloth, hold=pole, wind=[0, 3, 0])
 print("may change:", ", ".join(simulation.model.numbers("")))
 speeds = []
 for frame in simulation.frames(12):

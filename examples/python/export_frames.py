@@ -11,7 +11,7 @@ from gaussian_swaying.scenes import FlagScene
 folder = Path("export_frames")
 folder.mkdir(exist_ok=True)
 pole = Box([None, None, None], [0.06, None, None])
-simulation = Simulation(FlagScene(spacing=0.05), Material(E=3e3, density=30.0), hold=pole, wind=[0, 4, 0])
+simulation = Simulation(FlagScene(spacing=0.05), Material(E=3e3, density=30.0), hold=pole, wind=[3, 2, 0])
 for frame in simulation.frames(4):
     frame.save(folder / f"{frame.index:04d}.spz")
 first, last = (read_gaussians(folder / f"{k:04d}.spz").means for k in (0, 3))

@@ -34,7 +34,7 @@ class Springs(Solver):
 
 
 if __name__ == "__main__":
-    flag = Simulation(FlagScene(spacing=0.1), Material(density=30.0), solver=Springs(), wind=[0, 4, 0])
+    flag = Simulation(FlagScene(spacing=0.05), Material(density=30.0), solver=Springs(), wind=[3, 2, 0])
     *_, frame = flag.frames(6)
     print(f"moved by {frame.health.displacement_mean:.3f} m")
     assert 0 < frame.health.displacement_mean < 1

@@ -12,8 +12,8 @@ from gaussian_swaying.scenes import FlagScene
 pole = PinnedRegion(Box([None, None, None], [0.12, None, None]))
 solver = MPMSolver(dx=0.13, boundaries=[pole])
 simulation = Simulation(
-    FlagScene(spacing=0.06), Material(E=5e3, density=30.0), solver=solver, wind=[5, 1, 0], camera=OrbitCamera(),
-    device="cpu",
+    FlagScene(spacing=0.06), Material(E=5e3, density=30.0), solver=solver, wind=[5, 1, 0], device="cpu",
+    camera=OrbitCamera(), background=[0.55, 0.68, 0.80],
 )  # fmt: skip
 page = Path("live_page.html")
 write_live_web(simulation, "flag", page)

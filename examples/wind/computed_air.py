@@ -10,7 +10,7 @@ from gaussian_swaying.wind.computed_air import ComputedAir
 air = ComputedAir(low=[-1.2, -0.8, -0.8], high=[1.6, 0.8, 0.8], cells=24, speed=12.0)
 pole = Box([None, None, None], [0.11, None, None])
 cloth = Material(E=1e4, density=100.0)
-simulation = Simulation(FlagScene(spacing=0.1), cloth, hold=pole, wind=[0, 4, 0], air=air)
+simulation = Simulation(FlagScene(spacing=0.05), cloth, hold=pole, wind=[0, 4, 0], air=air)
 *_, frame = simulation.frames(4)
 frame.save("computed_air.png")
 print(f"moved by {frame.health.displacement_mean:.4f} m in air of {simulation.stepper.air.resolution}")

@@ -15,7 +15,7 @@ Path("anemometer.csv").write_text("\n".join(rows) + "\n")
 wind = WindField(flow=None, schedule="anemometer.csv")
 speeds = [float(wind(torch.tensor(time, dtype=torch.float64)).norm()) for time in (0.0, 0.15, 0.3)]
 pole = Box([None, None, None], [0.11, None, None])
-simulation = Simulation(FlagScene(spacing=0.1), Material(E=3e3, density=30.0), hold=pole, wind=wind)
+simulation = Simulation(FlagScene(spacing=0.05), Material(E=3e3, density=30.0), hold=pole, wind=wind)
 *_, frame = simulation.frames(10)
 frame.save("wind_from_a_file.png")
 print("speeds", *(f"{speed:.1f}" for speed in speeds), f"m/s; moved by {frame.health.displacement_mean:.3f} m")

@@ -296,12 +296,12 @@ class FlowState:
 class LatticeFlow(nn.Module):
     """A flow on a box of cubic cells: D3Q27, a regularised collision with third-order terms, Smagorinsky's model.
 
-    A wall lies halfway between the centres of a wall cell and its neighbour (bounce-back), or, where its shape is given
-    as a function, where it is (interpolated bounce-back of Bouzidi, Firdaouss and Lallemand 2001, Phys. Fluids 13); it
-    may move along its surface. The outermost cells of a ``wall`` face are wall cells. Those of an ``open`` face have
-    the velocity of the wind and the pressure of their neighbour where the wind blows in or along the face (sound may
-    leave, see :func:`hold_faces`), and the pressure at rest and the velocity of their neighbour where it blows out. Its
-    kernels take float32, and on a CPU also float64.
+    A wall given by its cells lies halfway between a wall cell and its neighbour (bounce-back). One given by a function
+    lies exactly where the function says (interpolated bounce-back: Bouzidi, Firdaouss and Lallemand 2001, Phys. Fluids
+    13). Walls may move along their surface. The outermost cells of a ``wall`` face are wall cells. Cells of an ``open``
+    face take the velocity of the wind and the pressure of their neighbour where the wind blows in (sound may leave, see
+    :func:`hold_faces`), and the pressure at rest and the velocity of their neighbour where it blows out. Kernels take
+    float32, on a CPU also float64.
 
     Args:
         cells: Cells along x, y and z. With one cell along an axis, which must be periodic, the flow is two-dimensional.

@@ -37,7 +37,6 @@ CPU_BLOCK = 16
 
 @triton.jit
 def _axis(x):
-    """First of the three cells around a place on one axis, and their weights."""
     low = tl.floor(x - 0.5)
     f = x - low
     return low.to(tl.int32), (0.5 * (1.5 - f) * (1.5 - f), 0.75 - (f - 1.0) * (f - 1.0), 0.5 * (f - 0.5) * (f - 0.5))
@@ -68,7 +67,6 @@ def _cell(reach, kind, nx, ny, nz, mask, Q: tl.constexpr):
 
 @triton.jit
 def _reach(place, p, kind, nx, ny, nz, mask):
-    """The cells around points, and a factor with which the weights of those of air add up to one."""
     x, y, z = load3(place, 1, 3 * p, mask)
     bx, wx = _axis(x)
     by, wy = _axis(y)
@@ -153,7 +151,7 @@ def look(moments: Tensor, area: Tensor, place: Tensor, kind: Tensor) -> tuple[Te
 
 
 def values_at(field: Tensor, place: Tensor, kind: Tensor) -> Tensor:
-    """Values at points of a field of three numbers for each cell, (3, X, Y, Z), as :func:`look`; shape (P, 3)."""
+    """Interpolate a vector field (3, X, Y, Z) at points, as :func:`look` does the velocity; shape (P, 3)."""
     return _read(field, field.new_zeros(len(place)), field.new_zeros(kind.numel()), place, kind)[0]
 
 
@@ -180,7 +178,6 @@ def give(moments: Tensor, taken: Tensor, place: Tensor, kind: Tensor) -> None:
 
 
 def _scatter(place: Tensor) -> tuple[int, dict[str, Any]]:
-    """The number of programs that add up, and their options."""
     atomic = place.device.type == "cuda" or INTERPRETED
     block = BLOCK if atomic else 1
     blocks = triton.cdiv(len(place), block)

@@ -17,7 +17,7 @@ _SAMPLE = 1000  # points that are looked at
 
 
 def places_in_picture(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Where a camera sees points, ignoring what hides them.
+    """Project points into a camera, ignoring occlusion.
 
     Args:
         points: Points [scene units], on the CPU, shape (N, 3).
@@ -34,7 +34,7 @@ def places_in_picture(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 def cameras_that_see(points: Tensor, cameras: Sequence[Camera]) -> tuple[int, int]:
-    """How many cameras see any of the points (N, 3): as they are, and with y and z of their axes turned round."""
+    """Number of cameras that see any of the points (N, 3): as given, and with y and z of the camera flipped."""
     some = points[:: -(-len(points) // _SAMPLE)].double()
     turned = [replace(camera, world_to_camera=turned_axes(camera.world_to_camera)) for camera in cameras]
     as_given, other = (sum(bool(places_in_picture(some, c)[1].any()) for c in kind) for kind in (cameras, turned))
@@ -42,5 +42,5 @@ def cameras_that_see(points: Tensor, cameras: Sequence[Camera]) -> tuple[int, in
 
 
 def turned_axes(world_to_camera: Tensor) -> Tensor:
-    """A pose (4, 4) with y and z of the camera turned round: axes of OpenGL in place of those of OpenCV, or back."""
+    """A pose (4, 4) with the camera's y and z flipped: between OpenGL's and OpenCV's axes."""
     return world_to_camera * world_to_camera.new_tensor([1.0, -1.0, -1.0, 1.0])[:, None]

@@ -88,7 +88,6 @@ class Capture:
     origin: Origin = NO_ORIGIN
 
     def split(self, name: str) -> tuple[View, ...]:
-        """Views of ``train``, ``val`` or ``test``, sorted by name."""
         check_choice("name", name, SPLITS)
         return tuple(view for view in self.views if view.split == name)
 
@@ -114,9 +113,6 @@ def read_capture(
         test_every: Every n-th image, sorted by name and starting with the first, is used for testing; 0 for none. Not
             used if the capture's files define training and test images.
         images: Folder of the images of a COLMAP model.
-
-    Returns:
-        The capture.
 
     Raises:
         FileNotFoundError: If ``path`` does not exist.
@@ -240,14 +236,12 @@ def _read(root: Path, format: str, images: str) -> _Files:
 
 
 def _counted(posed: list[PosedImage]) -> tuple[list[PosedImage], Origin]:
-    """The images with poses that count from an origin near their cameras."""
     poses = [item.world_to_camera for item in posed]
     origin = origin_of(np.array([(-pose[:3, :3].T @ pose[:3, 3]).tolist() for pose in poses]).reshape(-1, 3))
     return [replace(item, world_to_camera=counted_pose(item.world_to_camera, origin)) for item in posed], origin
 
 
 def _check_once(root: Path, posed: Sequence[PosedImage]) -> None:
-    """Raise ValueError if a photo has two cameras."""
     first: dict[Path, PosedImage] = {}
     for item in posed:
         other = first.setdefault(item.path, item)
@@ -259,7 +253,6 @@ def _check_once(root: Path, posed: Sequence[PosedImage]) -> None:
 
 
 def _check_sight(root: Path, views: Sequence[View], points: Tensor, read_axes: bool) -> None:
-    """Raise ValueError if most cameras see no point."""
     seen, turned = cameras_that_see(points, [view.camera for view in views])
     if 2 * seen < len(views):
         cause = "they are not of the same reconstruction as the points: export both again, or remove the points"
@@ -270,7 +263,7 @@ def _check_sight(root: Path, views: Sequence[View], points: Tensor, read_axes: b
 
 
 def nearest_to_axes(cameras: Sequence[Camera]) -> Tensor:
-    """The point with the smallest sum of squared distances to all optical axes.
+    """The point closest to all optical axes, by least squares.
 
     Returns:
         The point [scene units], float64, shape (3,); NaN if the axes are parallel.
@@ -285,7 +278,7 @@ def nearest_to_axes(cameras: Sequence[Camera]) -> Tensor:
 
 
 def axes_meet_behind(cameras: Sequence[Camera]) -> bool:
-    """Whether the optical axes meet in one point that is behind all cameras."""
+    """True if all optical axes meet in one point behind the cameras."""
     focus = nearest_to_axes(cameras)
     local = [camera.world_to_camera[:3].double() @ torch.cat([focus, focus.new_ones(1)]) for camera in cameras]
     return all(bool(place[:2].norm() < -0.1 * place[2]) for place in local)
@@ -316,7 +309,6 @@ def view_reach(cameras: Sequence[Camera], focus: Tensor) -> float:
 
 
 def _splits(root: Path, posed: list[PosedImage], test_every: int) -> list[str]:
-    """Split of each image; images without a split in the files are for training."""
     if any(item.split is not None for item in posed):
         splits = [item.split or "train" for item in posed]
         remedy = "add images to its train split"
@@ -361,7 +353,6 @@ def _view(root: Path, item: PosedImage, split: str, downscale: int) -> tuple[Vie
 
 
 def _made_smaller(root: Path, path: Path, downscale: int) -> Path | None:
-    """The same image in the folder ``<folder>_<downscale>`` beside the folder of the images, or None."""
     top = root if root.is_dir() else root.parent
     parts = path.relative_to(top).parts if path.is_relative_to(top) else ()
     return Photos(top / f"{parts[0]}_{downscale}").find("/".join(parts[1:])) if len(parts) > 1 else None
@@ -387,7 +378,6 @@ def neighbouring_views(cameras: Sequence[Camera], count: int = 8, largest_angle:
     larger one the picture looks different. A view from the same place tells nothing of depth and is left out.
 
     Args:
-        count: Most views for each.
         largest_angle: Largest angle between the axes of two views [degrees].
 
     Returns:

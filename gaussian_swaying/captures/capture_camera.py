@@ -37,7 +37,6 @@ def read_views(
         width: Width of the images to render [pixels]; by default that of the capture.
         height: Height of the images to render [pixels]; by default that of the capture.
         near: Near plane [scene units]; a hundredth of the distance or of the object's size when None.
-        origin: Point of the file from which places count.
 
     Returns:
         Name and camera of each view, sorted by name. Lens distortion is ignored: the cameras are pinhole cameras with
@@ -97,7 +96,6 @@ class CaptureCamera(CameraPath):
 
     @property
     def still(self) -> bool:  # type: ignore[override]
-        """True for one view."""
         return self.view is not None
 
     def __post_init__(self) -> None:

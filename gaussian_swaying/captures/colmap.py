@@ -38,12 +38,9 @@ _READABLE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
 
 def colmap_models(path: Path) -> list[tuple[Path, int]]:
-    """The folders below a capture with sparse models, and the number of images of each; that with most comes first.
+    """Folders of sparse models below a capture, with their numbers of images, the largest first.
 
     Models are in ``sparse`` or ``colmap/sparse``, in numbered folders there, or in the folder itself.
-
-    Args:
-        path: Folder of the capture, or of a model.
     """
     folders = []
     for top in (path / "sparse", path / "colmap" / "sparse"):
@@ -122,7 +119,6 @@ def _lens(identity: int, model: str, width: int, height: int, values: tuple[floa
 
 
 def _read(model: Path, name: str, binary: Callable[[bytes], Any], text: Callable[[Iterator[str]], Any]) -> Any:
-    """Parse one file of the model, or raise an error that names it."""
     file = model / f"{name}.bin"
     if not file.is_file():
         file = model / f"{name}.txt"
@@ -212,7 +208,6 @@ def _text_images(lines: Iterator[str]) -> list[tuple[str, tuple[float, ...], int
 
 
 def _sees(line: str) -> bool:
-    """Whether a line has triples of numbers, of which that of an image has only the first ones."""
     words = line.split()
     try:
         return len([float(word) for word in words[:12]]) % 3 == len(words) % 3 == 0

@@ -166,8 +166,6 @@ class GeneratedCapture:
         return hit.view_as(v), x.view_as(v), z.view_as(v)
 
     def _first_crossing(self, eye: Tensor, rays: Tensor, enter: Tensor, leave: Tensor) -> tuple[Tensor, Tensor]:
-        """Return a mask of the rays that cross the sheet between two depths, and the first depth of these crossings."""
-
         def above(t: Tensor, rays: Tensor) -> Tensor:
             x, y, z = (eye[axis] + t * rays[:, axis] for axis in range(3))
             return y - self.elevation(x, z)
@@ -191,12 +189,6 @@ class GeneratedCapture:
         """Write the capture: ``images/`` and ``transforms.json``.
 
         Images are PNG with alpha; colours are not multiplied with it. ``transforms.json`` is written last.
-
-        Args:
-            folder: Folder to write, new or empty.
-
-        Returns:
-            The folder.
         """
         from imageio.v3 import imwrite
 

@@ -131,7 +131,6 @@ def load_image(
 
     Args:
         downscale: Each pixel of the result is the mean of a square of this many pixels on a side.
-        turned: Whether to turn the pixels as the EXIF tag says.
 
     Returns:
         Pixels, dtype uint8, shape (H, W, 3), or (H, W, 4) with colours that are multiplied with alpha. Their lens is
@@ -155,7 +154,7 @@ def load_image(
 
 
 def read_mask(mask: Path, path: str | Path, lens: Lens) -> Tensor:
-    """Read the mask of a photo, in the size of its lens: dtype uint8, shape (H, W)."""
+    """Read the mask of a photo at the size of its lens: uint8, shape (H, W)."""
     pixels = read_image(mask).float()
     found = pixels[..., 0] if pixels.shape[-1] == 3 else pixels[..., 0] * pixels[..., 3] / 255
     if float(found.max()) == 1:  # numbers of labels
@@ -176,12 +175,12 @@ def _pixels_of(image: Tensor) -> Tensor:
 
 
 def remapped(pixels: Tensor, lens: Lens) -> Tensor:
-    """Pixels (H, W, C) of dtype uint8, as ``lens.undistorted()`` sees them."""
+    """The undistorted picture of uint8 pixels (H, W, C)."""
     return _pixels_of(remap(rearrange(pixels, "h w c -> c h w").float(), lens, lens.undistorted()))
 
 
 def check_image_size(path: str | Path, size: tuple[int, int], lens: Lens) -> None:
-    """Raise ValueError unless an image of ``size`` (width, height) [pixels] matches its lens."""
+    """Raise ValueError unless an image size (width, height) [pixels] matches its lens."""
     if size != (lens.width, lens.height):
         raise ValueError(
             f"The image {path} has {size[0]} x {size[1]} pixels, but its camera has {lens.width} x {lens.height}: "

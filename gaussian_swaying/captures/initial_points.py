@@ -39,9 +39,6 @@ def initial_points(
         count: Number of random or consistent points. All points of a capture or a file are used.
         half_side: Half the side of the cube [scene units]. The default is how far the median camera sees to each side
             of the point that all cameras look at.
-
-    Returns:
-        The points.
     """
     check_whole("count", count, 1)
     if source == "capture" or (source == "auto" and capture.points is not None):
@@ -78,7 +75,6 @@ def random_points(center: Tensor, half_side: float, count: int, seed: int = 0) -
 
 
 def _away_from_cameras(capture: Capture, center: Tensor, reach: float, count: int, seed: int) -> PointCloud:
-    """Random points of a cube; points close to a camera are drawn again."""
     points = colors = torch.zeros(0, 3)
     for attempt in range(_ATTEMPTS):
         more = random_points(center, reach, count, seed + 1_000_003 * attempt)
@@ -154,7 +150,6 @@ def consistent_points(capture: Capture, count: int, seed: int = 0, half_side: fl
 
 
 def _focus(capture: Capture) -> Tensor:
-    """The point nearest to all optical axes, or an error if the cameras do not look at it."""
     cameras = [view.camera for view in capture.split("train")]
     focus = common_focus(cameras)
     if focus is None:

@@ -118,12 +118,12 @@ class Lens:
         return any(self.distortion)
 
     def resized(self, width: int, height: int) -> Lens:
-        """The lens of the same picture at another size [pixels]."""
+        """The same lens for pictures of another size [pixels]."""
         x, y = width / self.width, height / self.height
         return replace(self, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y, width=width, height=height)
 
     def averaged(self, factor: int) -> Lens:
-        """The lens of the picture whose pixels are means over ``factor`` x ``factor`` pixels of this one.
+        """The lens after averaging ``factor`` x ``factor`` pixels into one.
 
         Rows and columns that do not fill a pixel are cut off at the lower and the right edge.
         """
@@ -152,7 +152,6 @@ class Lens:
 
 @lru_cache(maxsize=1024)  # the images of a capture share a lens or have one each
 def _undistorted(lens: Lens) -> Lens:
-    """See :meth:`Lens.undistorted`."""
     focal = torch.tensor([lens.fx, lens.fy], dtype=torch.float64)
     center = torch.tensor([lens.cx, lens.cy], dtype=torch.float64)
     x = torch.linspace(0.5, lens.width - 0.5, lens.width, dtype=torch.float64)
@@ -179,7 +178,7 @@ def _undistorted(lens: Lens) -> Lens:
 
 
 def remap(image: Tensor, source: Lens, target: Lens) -> Tensor:
-    """Picture of a pinhole lens, by bilinear interpolation in the picture of a distorted one.
+    """Undistort a picture, with bilinear interpolation.
 
     Args:
         image: Picture taken with ``source``, channels first, floating point, shape (C, H, W).

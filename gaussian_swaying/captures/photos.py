@@ -33,9 +33,6 @@ class Photos:
         It is the file of this name, or else one whose name differs in case, spaces, Unicode form or, for photos, the
         ending, which may be missing. Of a path from another computer, the longest end that exists here counts.
 
-        Args:
-            name: Path with forward or back slashes.
-
         Raises:
             ValueError: If several files fit.
         """
@@ -57,7 +54,6 @@ class Photos:
         return exact
 
     def _index(self) -> dict[str, list[Path]]:
-        """All photos below the folder by the keys of their names, with and without the ending."""
         if self._files is None:
             self._files = {}
             for path in photos_below(self.folder):
@@ -69,7 +65,6 @@ class Photos:
 
 
 def _key(name: str, stem: bool = False) -> str:
-    """What names of the same photo have in common; that without an ending has a slash at its end."""
     if stem:
         start, end = os.path.splitext(name)
         name = (start if end.lower() in SUFFIXES else name) + "/"
@@ -83,7 +78,7 @@ def photos_below(folder: Path) -> list[Path]:
 
 
 def photos_beside(folder: Path, used: Iterable[Path], masks: Iterable[Path | None]) -> list[Path]:
-    """Photos in the same folders as those of a capture, which it does not have.
+    """Photos in the folders of a capture that the capture does not list.
 
     Pictures made of a photo do not count: their names begin with its name, as ``r_0_depth_0001.png`` with ``r_0``.
     """
@@ -102,7 +97,7 @@ def photos_beside(folder: Path, used: Iterable[Path], masks: Iterable[Path | Non
 
 
 def is_turned(size: tuple[int, int], orientation: int, wanted: tuple[float, float]) -> bool | None:
-    """Whether a camera describes a photo turned as its EXIF tag says; None if sizes do not tell.
+    """Whether a camera describes the photo as rotated by its EXIF tag; None if sizes do not tell.
 
     Args:
         size: Width and height of the pixels in the file.
@@ -117,5 +112,5 @@ def is_turned(size: tuple[int, int], orientation: int, wanted: tuple[float, floa
 
 
 def turned_size(size: tuple[int, int], orientation: int) -> tuple[int, int]:
-    """Width and height after the turn of an EXIF tag."""
+    """Width and height after the rotation of an EXIF tag."""
     return size[::-1] if orientation >= 5 else size

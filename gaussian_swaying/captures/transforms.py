@@ -75,7 +75,6 @@ def read_transforms(path: Path) -> tuple[list[PosedImage], list[str], Path | Non
 
 
 def _merged(data: dict[str, object], frame: dict[str, object]) -> dict[str, object]:
-    """Fields of a frame, completed by those at the top; an angle in the frame overrides a focal length at the top."""
     hidden: set[str] = set()
     for axis, other in ("xy", "yx"):
         if f"fl_{axis}" in frame or f"camera_angle_{axis}" in frame:
@@ -110,7 +109,6 @@ def _file_path(where: str, index: int, frame: dict[str, Any], field: str = "file
 
 
 def _listed_splits(where: str, data: dict[str, Any]) -> dict[str, str] | None:
-    """Split of each file name from Nerfstudio's lists, or None without such lists."""
     result: dict[str, str] = {}
     for split in _SPLITS:
         names = data.get(f"{split}_filenames")
@@ -126,7 +124,6 @@ def lens_of_transforms(where: str, data: dict[str, Any], frame: dict[str, Any], 
     """The lens of a frame.
 
     Args:
-        where: The file, for messages.
         size: Width and height of the pictures, if the file does not say them [pixels].
     """
     fields = _merged(data, frame)

@@ -59,9 +59,6 @@ def run_command(
 
     Args:
         command: Does the work and gives an exit code; None is 0.
-        stopped: Message after Ctrl-C.
-        memory: Remedy to name if there is not enough memory.
-        expected: Further exceptions whose message is meant for users.
         arguments: Command line, for messages; that of the process if None.
         advice: Returns an additional message after an error or stop, or None.
 
@@ -110,8 +107,6 @@ def _bug(error: Exception) -> str:
 
 
 def _once(shown: set[str]) -> Callable[..., None]:
-    """A function that shows each warning once, in one line, without its line of code."""
-
     def show(message: Warning | str, *where: object, **named: object) -> None:
         text = str(message)
         if text not in shown:
@@ -127,14 +122,7 @@ def sentence(
     expected: tuple[type[BaseException], ...] = (),
     arguments: Sequence[str] = (),
 ) -> str | None:
-    """The message of an error for users, in one line; None if it is a bug.
-
-    Args:
-        error: The error.
-        memory: Remedy if there is not enough memory.
-        expected: Further exceptions whose message is meant for users.
-        arguments: Command line, for messages.
-    """
+    """The message of an error for users, in one line; None if it is a bug."""
     text = first_line(error)
     if isinstance(error, MemoryError | torch.OutOfMemoryError) or (
         isinstance(error, RuntimeError | ValueError) and _MEMORY.search(text)
@@ -184,7 +172,6 @@ _NO_CLASS = re.compile(r'Parser key "([\w.]+)": Expected an instantiatable class
 
 
 def _asked_for(text: str) -> str:
-    """Return the requested amount of memory in words, from an error message; empty if it does not say."""
     amount = re.search(r"allocate (\d+) bytes", text)
     if amount:
         return f"{int(amount[1]) / 2**30:,.3g} GiB were requested"
@@ -193,7 +180,6 @@ def _asked_for(text: str) -> str:
 
 
 def _of_the_system(error: OSError) -> str:
-    """A sentence from an error of the system, with a number and a file, or the message of one of our errors."""
     if error.errno is None or error.strerror is None:
         return parser_sentence(str(error))
     where = error.filename or "A file"
@@ -227,11 +213,7 @@ def guessing(parser: ArgumentParser) -> Iterator[None]:
 
 
 def did_you_mean(message: str, parser: ArgumentParser) -> str:
-    """A question to add to a message about an unknown option; empty if nothing comes close.
-
-    Args:
-        parser: The parser, for the names of its options.
-    """
+    """A question to add to a message about an unknown option; empty if nothing comes close."""
     for pattern in _UNKNOWN:
         unknown = pattern.search(message)
         if unknown is None:
@@ -247,13 +229,11 @@ def did_you_mean(message: str, parser: ArgumentParser) -> str:
 
 
 def _nearest(name: str, known: dict[str, str]) -> str | None:
-    """The spelling of the most similar known name; None if none is similar."""
     near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.75)
     return known[near[0]] if near else None
 
 
 def _options(parser: Any) -> dict[str, str]:
-    """Names of all options of a parser and its commands: the form used to compare, and the spelling."""
     names: dict[str, str] = {}
     for action in parser._actions:
         for choice in (getattr(action, "_name_parser_map", None) or {}).values():

@@ -36,11 +36,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parse and compare.
-
-    Returns:
-        The exit code, as from :func:`~gaussian_swaying.cli.errors.run_command`.
-    """
+    """Parse and compare."""
     parser = build_parser()
     return run_command(
         lambda: compare(parser.parse_args(arguments)),

@@ -92,7 +92,6 @@ def fit(options: argparse.Namespace, begun: list[str]) -> int:
 
 
 def _length(given: Sequence[str] | None) -> Any:
-    """Name and metres of ``--length``."""
     if given is None or list(given) == ["gravity"]:
         return given and "gravity"
     metres = " ".join(given[1:]) or "nothing"

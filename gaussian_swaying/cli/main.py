@@ -40,9 +40,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Args:
         arguments: Its name and its arguments; those of the process if None.
 
-    Returns:
-        The exit code of the command.
-
     Raises:
         SystemExit: With code 2 if there is no such command, or none can be loaded here.
     """

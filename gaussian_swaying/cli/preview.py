@@ -221,11 +221,7 @@ def joined(arguments: Sequence[str]) -> list[str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Preview, print the report and write the files.
-
-    Returns:
-        The exit code, as from :func:`~gaussian_swaying.cli.errors.run_command`.
-    """
+    """Preview, print the report and write the files."""
     arguments = joined(sys.argv[1:] if arguments is None else arguments)
     parser = build_options()
     return run_command(

@@ -65,7 +65,6 @@ def settings_of(
 
 
 def _configuration(scene: str) -> str | None:
-    """The configuration that a scene is, or None for a splat."""
     path = Path(scene)
     if (path / "config.yaml").is_file():
         return str(path / "config.yaml")

@@ -21,11 +21,7 @@ if TYPE_CHECKING:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parse, build, run.
-
-    Returns:
-        The exit code, as from :func:`~gaussian_swaying.cli.errors.run_command`.
-    """
+    """Parse, build, run."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     parser = Simulation.parser()
     started: list[Simulation] = []
@@ -47,7 +43,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _simulate(parser: ArgumentParser, arguments: Sequence[str], started: list[Simulation]) -> None:
-    """Parse, build, run, and report the files; the simulation is put into ``started`` before it writes anything."""
     arguments = with_shipped(arguments, "sim")
     with guessing(parser):
         settings = parser.parse_args(arguments)

@@ -45,11 +45,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parse and sweep.
-
-    Returns:
-        The exit code, as from :func:`~gaussian_swaying.cli.errors.run_command`.
-    """
+    """Parse and sweep."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     parser = build_parser()
     return run_command(

@@ -40,7 +40,6 @@ def make_cli(arguments: Sequence[str] | None = None, run: bool = True, run_folde
 
     Args:
         arguments: Command line; that of the process if None.
-        run_folder: The callback that takes the folder, to be asked afterwards.
     """
     limit_yaml(lambda found: with_named_materials(refuse_gone(found)))
     given = with_lists(with_shipped(sys.argv[1:] if arguments is None else arguments, "train"))
@@ -60,11 +59,7 @@ def make_cli(arguments: Sequence[str] | None = None, run: bool = True, run_folde
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parse and run.
-
-    Returns:
-        The exit code, as from :func:`~gaussian_swaying.cli.errors.run_command`.
-    """
+    """Parse and run."""
     run_folder, given = RunFolder(), sys.argv[1:] if arguments is None else list(arguments)
 
     def how_to_continue(error: BaseException) -> str | None:

@@ -55,12 +55,7 @@ GONE = {
 
 
 def refuse_gone(found: Any, within: str = "") -> Any:
-    """Return what was read from YAML; ValueError if it has a name that is gone.
-
-    Args:
-        found: A mapping, a list or a value.
-        within: The class or the field that it belongs to.
-    """
+    """Return what was read from YAML; ValueError if it has a name that is gone."""
     if isinstance(found, Mapping):
         kind = str(found.get("class_path", "")).rpartition(".")[-1]
         for name, value in found.items():

@@ -37,7 +37,6 @@ def with_named_materials(found: Any) -> Any:
 
 
 def _numbers(given: Mapping[str, Any], field: str) -> dict[str, Any]:
-    """Fields of a material without its name: the numbers of the name, and those that were given."""
     own = {key: value for key, value in given.items() if key != "name"}
     name = given.get("name")
     return own if name is None else {**known_material(name, field).numbers, **own}

@@ -71,11 +71,7 @@ class PresetAction(Action):
 
 
 def build_parser(schema: type) -> ArgumentParser:
-    """The parser of ``gaussian-swaying sim``: one group of options per component, typos are errors.
-
-    Args:
-        schema: The class whose constructor defines the fields of a configuration.
-    """
+    """The parser of ``gaussian-swaying sim``: one group of options per component, typos are errors."""
     from jsonargparse import ActionYesNo
 
     limit_yaml(lambda found: with_named_materials(refuse_gone(found)))
@@ -135,7 +131,7 @@ def _parser_class() -> type[ArgumentParser]:
 
 
 def with_lists(arguments: Sequence[str]) -> list[str]:
-    """A command line with brackets round numbers with commas between them, as a shell such as zsh eats brackets.
+    """A command line with brackets round comma-separated numbers, as shells such as zsh eat brackets.
 
     Example:
         >>> with_lists(["--wind.flow", "-8,0,0", "--region.min=null,0,1e-1"])
@@ -164,7 +160,6 @@ def arguments_of(schema: type) -> list[str]:
 
 
 def _groups(schema: type) -> dict[str, type]:
-    """The arguments that are a single component each; they become groups of options."""
     hints = get_type_hints(schema.__init__)  # type: ignore[misc]
     found: dict[str, type] = {}
     for name in arguments_of(schema):
@@ -371,7 +366,6 @@ class CommonHelp(Action):
         super().__init__(option_strings, dest=SUPPRESS, default=SUPPRESS, nargs=0, help=options["help"])
 
     def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
-        """Print and exit."""
         print(common_help(parser), end="")
         parser.exit()
 

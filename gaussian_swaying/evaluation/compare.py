@@ -202,11 +202,7 @@ def evaluate(
     video: bool = True,
     **options: Any,
 ) -> dict[str, Any]:
-    """Compare and write ``eval.json``, ``eval.md`` and ``comparison.mp4`` to a folder, each completely or not at all.
-
-    Returns:
-        The result of :func:`compare_run`.
-    """
+    """Compare, and write ``eval.json``, ``eval.md`` and ``comparison.mp4``, each completely or not at all."""
     folder = Path(output)
     _read_summary(Path(run))  # before the folder, which may be inside the run's, is made
     missing = [path for path in (folder, *folder.parents) if not path.exists()]

@@ -24,9 +24,6 @@ def patch_area(log_scales: Tensor) -> Tensor:
 
     Overlapping Gaussians are counted several times: see :func:`coverage_area` for areas that add up to the surface.
 
-    Args:
-        log_scales: Logarithm of the standard deviations [scene units], shape (..., 3).
-
     Returns:
         Areas [scene units^2], shape (...).
 
@@ -60,9 +57,6 @@ def coverage_area(
     result is the same on every device; not differentiable.
 
     Args:
-        means: Centres [scene units], shape (N, 3).
-        normals: Unit normals, of either sign, shape (N, 3).
-        log_scales: Logarithm of the standard deviations [scene units], shape (N, 3).
         opacity: Opacities from 0 to 1, shape (N,); None if all are equal.
         neighbours: Nearest centres to consider for each one, at least 6.
 

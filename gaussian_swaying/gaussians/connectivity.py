@@ -111,7 +111,6 @@ def _put_back(count: int, kept: Tensor, cut: Tensor) -> Tensor:
 
 
 def _strays(where: Tensor, pairs: Tensor, alone: Tensor | None) -> Tensor:
-    """Pairs that attach small pieces to the nearest of larger ones; of what stays alone only very small ones."""
     piece = joined(len(where), pairs.T)
     size = piece.bincount()
     largest = int(size.max())
@@ -132,7 +131,6 @@ def _allowed(pairs: Tensor, labels: Tensor, to: Sequence[int | None]) -> Tensor:
 
 
 def _missing(where: Tensor, pairs: Tensor, labels: Tensor, to: Sequence[int | None]) -> Tensor:
-    """Pairs that attach a part to the one that it names, where none does: those nearest to each other."""
     found = [pairs[:0]]
     for part, other in enumerate(to):
         if other is None or other == part:
@@ -149,7 +147,7 @@ def _missing(where: Tensor, pairs: Tensor, labels: Tensor, to: Sequence[int | No
 
 
 def pieces(cell: Tensor, pairs: Tensor) -> tuple[Tensor, Tensor]:
-    """Pieces of what is attached within cells.
+    """Connected pieces of Gaussians within each cell.
 
     Args:
         cell: A number for the cell of each Gaussian, from 0 on, shape (N,).

@@ -105,7 +105,7 @@ def ray_directions(count: int) -> list[tuple[int, int, int]]:
 
 
 def odd_crossings(dense: Tensor, direction: tuple[int, int, int]) -> Tensor:
-    """True for cells whose ray enters dense matter an odd number of times before it leaves the grid.
+    """Cells whose ray enters dense matter an odd number of times before it leaves the grid.
 
     Args:
         dense: Cells whose density is above the threshold, bool, shape (nx, ny, nz).
@@ -152,7 +152,7 @@ def enclosed(
 
 
 def open_air(air: Tensor) -> Tensor:
-    """Cells of air that are connected to the outside through faces of cells of air.
+    """Air cells connected to the outside through faces.
 
     Args:
         air: Cells that are air, bool, shape (nx, ny, nz); everything outside the grid is air.
@@ -331,9 +331,6 @@ class InteriorFilling:
             opacities: Opacities from 0 to 1, shape (N,).
             spacing: Side of a cell [m], used if the object has none.
             progress: Show a progress bar if it takes more than a second.
-
-        Returns:
-            Points, volumes, and which Gaussians are on the surface.
         """
         h = self.spacing if self.spacing is not None else spacing
         assert h is not None, "the scene gives its cells"
@@ -413,7 +410,7 @@ def solid_elements(field: Tensor, side: int, chunk: int = _CHUNK) -> Tensor:
 
 
 def assign(means: Tensor, element: Tensor, low: Tensor, spacing: float, resolution: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the element of the solid that each Gaussian belongs to, and a mask of those that need an extra point.
+    """The element of the solid of each Gaussian, and which elements need an extra point.
 
     A Gaussian belongs to the element that it is in, or else to the nearest one within 1.5 spacings. An element that
     contains the centre of a Gaussian needs no extra point.

@@ -79,11 +79,11 @@ class Format:
 
     @property
     def in_metres(self) -> bool:
-        """Whether it says which way is up and how long a unit is."""
+        """True if the format stores the up direction and the length of a unit."""
         return "rotation" in self.options
 
     def losses(self, cloud: GaussianCloud, **options: object) -> list[str]:
-        """What a file will not hold, with the number of Gaussians: a part of a sentence for each kind."""
+        """What a file of this format will lose of a cloud, with counts: one phrase per kind."""
         told, count, cloud = list[str](), len(cloud), cloud.to("cpu", torch.float32)
         low, high, most, faintest = self.small, self.large, self.harmonics, self.faintest
         thin, wide = cloud.scales.amin(-1), cloud.scales.amax(-1)
@@ -113,13 +113,11 @@ class Format:
 
 
 def _steps_of_spz(cloud: GaussianCloud, spz_version: int) -> Tensor:
-    """The steps of centres in an .spz file."""
     farthest = float(cloud.means.double().abs().max())
     return torch.full_like(cloud.opacities, 2.0 ** -fraction_bits(farthest), dtype=torch.float64)
 
 
 def _steps_of_sog(cloud: GaussianCloud) -> Tensor:
-    """The steps of centres in a SOG file."""
     places = cloud.means.double().abs()
     logs = cloud.means.double().sign() * places.log1p()
     return ((logs.amax(0) - logs.amin(0)) / 65535 * (1 + places)).amax(-1)
@@ -225,7 +223,7 @@ FORMATS: dict[str, Format] = {
 
 
 def endings(written: bool = False) -> dict[str, str]:
-    """The formats of files that are read, or written, by the endings of their names."""
+    """Readable, or with ``written`` writable, formats by the endings of their names."""
     return {
         ending: name
         for name, format in FORMATS.items()
@@ -235,12 +233,10 @@ def endings(written: bool = False) -> dict[str, str]:
 
 
 def _named(path: Path, known: dict[str, str]) -> str | None:
-    """The format of a file by the ending of its name: .compressed.ply rather than .ply; None if there is none."""
     return known.get(max((ending for ending in known if path.name.lower().endswith(ending)), key=len, default=""))
 
 
 def _check_beginning(path: Path, own: Format) -> None:
-    """Raise ValueError if the content is plainly another than the name says."""
     with check_regular(path, "the splat").open("rb") as stream:
         start = stream.read(64).removeprefix(b"\xef\xbb\xbf").lstrip().lower()
     if start.startswith(_PAGES):
@@ -397,5 +393,5 @@ def export_frames(
 
 
 def numbered(name: str, number: str) -> str:
-    """A name with a number, filled up with zeros, in place of each row of ``#``."""
+    """Replace the ``#`` of a name by a number padded with zeros."""
     return re.sub("#+", lambda digits: number.rjust(len(digits[0]), "0"), name)

@@ -132,7 +132,6 @@ def encode_gltf(cloud: GaussianCloud, rotation: Tensor | None = None, metres_per
 
 
 def _opened(path: Path) -> tuple[dict[str, Any], np.ndarray]:
-    """The document, and the data of a .glb file."""
     with path.open("rb") as stream:
         if stream.read(4) != b"glTF":
             return read_json(path, "glTF file"), np.empty(0, np.uint8)
@@ -247,7 +246,6 @@ def _numbers(root: dict[str, Any], buffers: Any, index: int, width: int) -> tupl
 
 
 def _buffer(path: Path, root: dict[str, Any], binary: np.ndarray, index: int) -> np.ndarray:
-    """The bytes of a buffer: in the file itself, in a data URI, or in a file of the same folder."""
     uri = root["buffers"][index].get("uri")
     if uri is None:
         return binary

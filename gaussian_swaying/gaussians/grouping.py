@@ -40,7 +40,6 @@ def grid_groups(
 
     Args:
         position: Points [m], shape (N, 3), in the precision in which the solver has them.
-        dx: Grid spacing [m].
         per_cell: Cubes along the side of a cell, at least 1.
         weight: Weights above zero, shape (N,).
         normal: Unit normals of either sign, zero inside a solid, shape (N, 3); None to keep no sheets apart.

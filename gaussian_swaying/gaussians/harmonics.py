@@ -66,7 +66,6 @@ def evaluate_sh(sh: Tensor, directions: Tensor) -> Tensor:
     """Value of spherical harmonics in given directions, before the offset and clamp of :func:`sh_to_color`.
 
     Args:
-        sh: Coefficients, shape (..., K, 3) with K = 1, 4, 9 or 16.
         directions: Directions from the camera to the Gaussians, of any length above zero, shape (..., 3).
 
     Returns:
@@ -115,7 +114,6 @@ def sh_to_color(sh: Tensor, directions: Tensor) -> Tensor:
     """Colour seen in given directions: the harmonics plus 0.5, clamped to be at least 0.
 
     Args:
-        sh: Coefficients, shape (..., K, 3) with K = 1, 4, 9 or 16.
         directions: Directions from the camera to the Gaussians, of any length above zero, shape (..., 3).
 
     Returns:
@@ -135,7 +133,6 @@ def rotate_sh(sh: Tensor, rotation: Tensor) -> Tensor:
     :math:`D_l = Y_l(d_k)^{-1} Y_l(R^T d_k)`, without Wigner recurrences. Differentiable.
 
     Args:
-        sh: Coefficients, shape (..., K, 3) with K = 1, 4, 9 or 16.
         rotation: Rotation matrices, shape (..., 3, 3), for example from the polar decomposition of a deformation
             gradient; the gradient itself is not a rotation.
 

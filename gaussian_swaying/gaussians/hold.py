@@ -161,7 +161,6 @@ def cord_heights(splat: Gaussians, up: Array) -> tuple[float, float] | None:
 
 
 def _above(splat: Gaussians, end: Array, up: Array, margin: float) -> bool:
-    """True if the centre of the visible area is above or below the hull of one end, within a margin."""
     angles = np.arange(8) * math.pi / 8
     along = plane_axes(up) @ [np.cos(angles), np.sin(angles)]
     at = np.average(splat.means, 0, splat.weight + 1e-300) @ along
@@ -170,7 +169,6 @@ def _above(splat: Gaussians, end: Array, up: Array, margin: float) -> bool:
 
 
 def _pole_side(points: Array, across: Array) -> tuple[tuple[float, ...], bool]:
-    """Direction of the upright side of a sheet that contains the origin; if none does, one of the sides, and False."""
     across = snapped(across / np.linalg.norm(across), 10)
     across = across * np.sign(across[np.abs(across).argmax()])
     along = points @ across
@@ -189,7 +187,7 @@ def hold_option(end: str, sideways: Sequence[float]) -> str:
 
 
 def columns(flat: Array, cell: float) -> Array:
-    """A number for the column of cells in which each place (N, 2) lies."""
+    """Number of the grid column of each place (N, 2)."""
     index = np.floor(flat / cell).astype(np.int64)
     return index[:, 0] * 2**31 + index[:, 1]
 
@@ -205,7 +203,7 @@ def _touched(points: Array, left_out: Array, outward: Array, cell: float) -> boo
 
 
 def given_hold(end: str, up: Sequence[float]) -> Guess:
-    """A given end: ``top``, ``bottom``, ``none``, or the axis ``+x`` to ``-z`` that points to it."""
+    """The end that an option names: ``top``, ``bottom``, ``none``, or the axis ``+x`` to ``-z`` towards it."""
     check_choice("--hold", end, ("top", "bottom", "none", *DIRECTIONS))
     if end in DIRECTIONS:
         return Guess("side", DIRECTIONS[end])
@@ -220,7 +218,6 @@ def end_region(points: Array, direction: Sequence[float], cell: float) -> Region
 
     Args:
         points: Centres of the simulated Gaussians [scene units], shape (N, 3).
-        direction: Unit vector from the object to the end.
         cell: Grid spacing [scene units].
     """
     axis = np.array(direction)
@@ -238,7 +235,7 @@ def end_region(points: Array, direction: Sequence[float], cell: float) -> Region
 
 
 def slab(centre: Array, normal: Array, start: float, size: tuple[float, float], cell: float) -> Cylinder:
-    """A cylinder around a point along a normal that begins at an offset, of a radius and a height [scene units]."""
+    """A cylinder along a normal, from an offset on, with ``size`` its radius and height [scene units]."""
     radius, height = rounded(size, cell)
     centre = centre + (start + 0.5 * size[1] - centre @ normal) * normal
     return Cylinder(rounded(centre, cell), [round(float(c), 6) for c in normal], radius, height)

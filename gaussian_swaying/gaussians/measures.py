@@ -94,12 +94,9 @@ class Guess:
 
 
 def ranked(reasons: Mapping[str, Sequence[tuple[float, str]]]) -> tuple[str, str, str, dict[str, float]]:
-    """The possibility with the most points, the next best, how sure that is, and all sums of points.
+    """The best candidate, the runner-up, the confidence, and the score of each.
 
     A lead of 2 gives high confidence, a lead of 1 medium, and less low.
-
-    Args:
-        reasons: For each possibility what speaks for it, with its points.
     """
     scores = {name: sum(points for points, _ in found) for name, found in reasons.items()}
     best, second = sorted(scores, key=lambda name: -scores[name])[:2]
@@ -108,17 +105,17 @@ def ranked(reasons: Mapping[str, Sequence[tuple[float, str]]]) -> tuple[str, str
 
 
 def quantile(values: Array, share: float) -> float:
-    """The value nearest to a quantile."""
+    """The sample nearest to a quantile."""
     return float(np.quantile(values, share, method="nearest"))
 
 
 def corners(points: Array, share: float = 0.005) -> Array:
-    """The range of points (N, ...) without a share of them at each end, along each axis: shape (2, ...)."""
+    """Bounds of points (N, ...) without the outermost ``share`` at each end of each axis: shape (2, ...)."""
     return np.quantile(points, (share, 1 - share), axis=0, method="nearest")
 
 
 def sides(points: Array, share: float = 0.005) -> Array:
-    """The sides of points (N, ...) without a share of them at each end, shape (...)."""
+    """Sides of the box of :func:`corners`, shape (...)."""
     return np.ptp(corners(points, share), axis=0)
 
 
@@ -170,7 +167,7 @@ def sheet_normal(points: Array) -> Array | None:
 
 
 def snapped(direction: Array, degrees: float) -> Array:
-    """A unit vector, or the axis within an angle of it."""
+    """A unit vector, replaced by an axis if one lies within an angle of it."""
     main = np.abs(direction).argmax()
     if abs(direction[main]) <= math.cos(math.radians(degrees)):
         return direction

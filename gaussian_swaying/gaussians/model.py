@@ -62,7 +62,7 @@ class DeformedGaussians:
 
     @torch.no_grad()
     def part_to_cloud(self, moving: bool) -> GaussianCloud:
-        """The Gaussians of :meth:`to_cloud` that may have moved, in the order of ``moving``, or all others."""
+        """The moving or the static part of :meth:`to_cloud`, in the order of ``moving``."""
         model = self._known()
         check_shape("means", self.means, None, 3, batches=False)
         index = torch.arange(len(self.means), device=self.means.device) if self.moving is None else self.moving
@@ -202,9 +202,6 @@ class GaussianSurfaceModel(Fixed, nn.Module):
         Args:
             position: Deformed centres [scene units], shape (..., N, 3).
             deformation_gradient: Total deformation gradients, shape (..., N, 3, 3).
-
-        Returns:
-            Centres, covariances, normals and rotations.
 
         Raises:
             ValueError: If a tensor does not have the shape above.

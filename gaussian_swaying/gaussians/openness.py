@@ -74,9 +74,6 @@ def openness(
     not differentiable. The lines are fixed, so a rotation changes the sum by about a percent.
 
     Args:
-        means: Centres [scene units], shape (N, 3).
-        normals: Unit normals, of either sign, shape (N, 3).
-        log_scales: Logarithm of the standard deviations [scene units], shape (N, 3).
         areas: Areas without shadow, above zero [scene units^2], shape (N,).
         opacity: Opacities from 0 to 1, shape (N,); None if all are opaque.
 
@@ -100,7 +97,7 @@ def openness(
     lines = spread_lines(_LINES)
 
     def along(number: int, line: Tensor, first: Tensor, second: Tensor) -> tuple[Tensor, ...]:
-        """Patches, and what they get of a line: light, shares of the skin, gaps and weights."""
+        """Along one line: the patches, with their light, shares of the skin, gaps and weights."""
         turn = torch.stack([first, second, line], dim=-1)
         facing = normal @ turn
         cosine = facing[:, 2].abs()

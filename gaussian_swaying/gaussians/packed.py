@@ -85,7 +85,7 @@ def size_logarithms(sizes: np.ndarray, name: str) -> tuple[np.ndarray, dict[str,
 
 
 def warn_antialiased(path: Path) -> None:
-    """Warn that a splat was trained with antialiasing, called by what a reader calls."""
+    """Warn that a splat was trained with antialiasing; for helpers of readers, as it sets the stack level."""
     warnings.warn(
         f"{path} was trained with antialiasing, without which it is drawn here: what is thin or far looks thicker.",
         UserWarning,

@@ -119,7 +119,6 @@ class Part:
 
     @property
     def has_material(self) -> bool:
-        """True if any of its numbers differs from that of the object."""
         return any(getattr(self, name) is not None for name in NUMBERS)
 
 
@@ -163,7 +162,7 @@ class Parts(Fixed):
                 )
 
     def attached_to(self) -> list[int | None] | None:
-        """For each part the only other part to which its material is attached, as its place, or None for any.
+        """For each part the index of the only part it may attach to; None for any.
 
         It is the part itself where it has a joint. None if no part names another.
         """
@@ -175,7 +174,6 @@ class Parts(Fixed):
         return None if all(place is None for place in found) else found
 
     def __len__(self) -> int:
-        """The number of Gaussians."""
         return len(self.labels)
 
     def __repr__(self) -> str:
@@ -204,7 +202,6 @@ class Parts(Fixed):
             )
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the file; returns its path."""
         small = np.uint8 if len(self.parts) <= 1 << 8 else np.uint16
         numbers: dict[str, Any] = {
             name: np.array([math.nan if getattr(p, name) is None else getattr(p, name) for p in self.parts], np.float64)
@@ -226,7 +223,6 @@ class Parts(Fixed):
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Parts:
-        """Read a file."""
         needed, more = ("count", "labels", "names", "roles"), (*NUMBERS, *JOINT, "attached")
         arrays = read_arrays(path, "the parts", needed, more, only=True)
         labels, names = arrays["labels"], arrays["names"]

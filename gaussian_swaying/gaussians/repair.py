@@ -27,7 +27,7 @@ _SAMPLE = 1 << 17  # centres that are looked at
 
 
 def faults(cloud: GaussianCloud) -> dict[str, Tensor]:
-    """What is wrong with Gaussians that have no meaning, by the properties of a .ply, and a mask (N,) for each kind."""
+    """Properties with meaningless values, each with a mask (N,) of the Gaussians concerned."""
     turn, size = cloud.quats.square().sum(-1), cloud.scales.amax(-1)
     found = {
         f"`x`, `y` or `z` is NaN, infinite or beyond ±{FARTHEST:g}": ~(cloud.means.abs() <= FARTHEST).all(-1),
@@ -46,13 +46,10 @@ def faults(cloud: GaussianCloud) -> dict[str, Tensor]:
 def repaired(
     path: Path, cloud: GaussianCloud, most: float = _MOST, others: dict[str, Tensor] | None = None
 ) -> GaussianCloud:
-    """The Gaussians that have a meaning.
+    """Remove Gaussians with meaningless values.
 
     A size of zero becomes a thousandth of the largest one of its Gaussian. An infinite logit of the opacity becomes
     ±16.
-
-    Args:
-        path: The file, for messages.
 
     Raises:
         ValueError: If more have none.
@@ -90,11 +87,7 @@ def repaired(
 
 
 def check_units(path: Path, cloud: GaussianCloud) -> None:
-    """Warn of numbers that no scene has, as in a file without logarithms or logits; ValueError if none is possible.
-
-    Args:
-        path: The file, for messages.
-    """
+    """Warn of numbers no scene has, as in a file without logarithms or logits; ValueError if all are impossible."""
     wide, told = cloud.scales.amax(-1), list[str]()
     if len(cloud) < _FEW:
         return
@@ -122,7 +115,6 @@ def cloud_of(path: Path, others: dict[str, np.ndarray] | None = None, **columns:
     """The Gaussians of a file as float32 tensors, :func:`repaired`.
 
     Args:
-        path: The file, for messages.
         columns: The fields of :class:`GaussianCloud` but its origin, with their shapes and units.
     """
     origin = origin_of(columns["means"])

@@ -20,7 +20,6 @@ def select_simulated(
     """Choose the Gaussians to simulate: those in a region that are opaque enough.
 
     Args:
-        means: Centres [scene units], shape (N, 3).
         opacities: Opacities from 0 to 1, after the sigmoid, shape (N,).
         region: Part of space to simulate; None for all of it.
         opacity_threshold: Smallest opacity to simulate, 0 to 1.

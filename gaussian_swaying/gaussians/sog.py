@@ -126,7 +126,6 @@ def encode_sog(cloud: GaussianCloud) -> bytes:
 
 
 def _beside(path: Path, name: str) -> bytes:
-    """The content of a file in the folder of meta.json."""
     steps = PurePosixPath(name).parts
     if not steps or ".." in steps or name.startswith("/") or "\\" in name or ":" in name:
         raise ValueError(f"{path} names the file {name[:80]!r}; put all files into its folder.")
@@ -134,11 +133,6 @@ def _beside(path: Path, name: str) -> bytes:
 
 
 def _decoded(path: Path, meta: dict[str, Any], read: Callable[[str], bytes]) -> GaussianCloud:
-    """The Gaussians of a meta.json.
-
-    Args:
-        read: Gives the content of a file by its name.
-    """
     if meta.get("version") != 2:
         raise ValueError(f"{path} is not SOG of version 2, or a streamed scene; convert it with splat-transform.")
     count, read = meta["count"], functools.cache(read)
@@ -243,7 +237,6 @@ def _palette(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _means(rows: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The means of clusters and the nearest for each row; they begin at rows that are evenly spaced."""
     from scipy.cluster.vq import kmeans2
 
     first = rows[np.linspace(0, len(rows) - 1, count).astype(int)]

@@ -113,7 +113,7 @@ def encode_spz(cloud: GaussianCloud, spz_version: int = 3) -> bytes:
 
 
 def fraction_bits(farthest: float) -> int:
-    """Bits behind the binary point of a centre, of which the largest coordinate allows so many."""
+    """Fractional bits of a centre's fixed-point number, given the largest coordinate."""
     return 24 if farthest == 0 else min(24, int(np.floor(np.log2((2**23 - 1) / farthest))))
 
 
@@ -121,7 +121,6 @@ def fraction_bits(farthest: float) -> int:
 
 
 def _opened(path: Path) -> tuple[tuple[Any, ...], list[np.ndarray], bytes]:
-    """The header, the parts and the extensions of a file; no more is decompressed than the header announces."""
     with path.open("rb") as raw:
         start = raw.read(4)
     if start[:2] == b"\x1f\x8b":
@@ -222,7 +221,6 @@ def _int24(values: np.ndarray) -> np.ndarray:
 
 
 def _from_three(raw: np.ndarray) -> np.ndarray:
-    """Quaternions wxyz from bytes of x, y and z; w is not negative."""
     xyz = raw.reshape(-1, 3) / 127.5 - 1
     return np.concatenate([np.sqrt(np.clip(1 - np.square(xyz).sum(-1, keepdims=True), 0, None)), xyz], axis=1)
 

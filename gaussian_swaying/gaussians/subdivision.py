@@ -176,7 +176,6 @@ def _thin(points: Tensor, order: Tensor, taken: Tensor, distance: float) -> Tens
 
 
 def _first_in_cell(points: Tensor, ranked: Tensor, size: float, shift: float) -> Tensor:
-    """Those of the ranked indices that come first in their cell of a grid, still ranked."""
     cell = torch.floor(points[ranked] / size + shift).long()
     cell -= cell.amin(0) if len(cell) else 0
     extent = cell.amax(0) + 1 if len(cell) else cell.new_ones(3)

@@ -40,7 +40,6 @@ def write_usd(
 
     Args:
         clouds: One for each frame, all of the same size; read one by one.
-        fps: Frames per second.
         metres_per_unit: Length of a scene unit [m].
         rotation: Rotation from scene directions to z up, shape (3, 3); the scene's z is up if None.
     """

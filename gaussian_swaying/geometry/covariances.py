@@ -13,10 +13,6 @@ from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_qu
 def covariance(quats: Tensor, log_scales: Tensor) -> Tensor:
     r"""Covariances :math:`A = R S S^T R^T` (Kerbl et al. 2023, equation 6).
 
-    Args:
-        quats: Quaternions wxyz of any length above zero, shape (..., 4).
-        log_scales: Logarithm of the standard deviations [scene units], shape (..., 3).
-
     Returns:
         Symmetric matrices [scene units^2], shape (..., 3, 3).
     """

@@ -23,7 +23,6 @@ LEAST = tl.constexpr(1.0842022e-19)
 
 @triton.jit
 def _outwards(x):
-    """Length and direction of a vector; z for one without a direction."""
     length = tl.sqrt(dot3(x, x))
     some = length > LEAST
     return length, where3(some, scale3(1 / tl.where(some, length, 1.0), x), (0.0, 0.0, 1.0))
@@ -31,14 +30,14 @@ def _outwards(x):
 
 @triton.jit
 def ball_distance(x, numbers, table, mask, OPTIONS: tl.constexpr):
-    """From a ball around the origin; ``numbers``: radius."""
+    """Distance from a ball around the origin; ``numbers``: radius."""
     length, direction = _outwards(x)
     return length - numbers[0], direction
 
 
 @triton.jit
 def capsule_distance(x, numbers, table, mask, OPTIONS: tl.constexpr):
-    """From all places within a radius of a segment around the origin.
+    """Distance from a capsule around the origin.
 
     ``numbers``: radius, half of the axis (3), one over the square of that.
     """
@@ -50,7 +49,7 @@ def capsule_distance(x, numbers, table, mask, OPTIONS: tl.constexpr):
 
 @triton.jit
 def box_distance(x, numbers, table, mask, OPTIONS: tl.constexpr):
-    """From a box around the origin; ``numbers``: half of the sides (3), axes in columns (9)."""
+    """Distance from a box around the origin; ``numbers``: half of the sides (3), axes in columns (9)."""
     axes = chosen(numbers, 3, 9)
     x = matvec(transpose(axes), x)
     b = (tl.abs(x[0]) - numbers[0], tl.abs(x[1]) - numbers[1], tl.abs(x[2]) - numbers[2])
@@ -68,13 +67,12 @@ def box_distance(x, numbers, table, mask, OPTIONS: tl.constexpr):
 
 @triton.jit
 def half_space_distance(x, numbers, table, mask, OPTIONS: tl.constexpr):
-    """From a plane through the origin; ``numbers``: its normal."""
+    """Distance from a plane through the origin; ``numbers``: its normal."""
     return dot3(x, numbers), add3(numbers, 0.0, x)
 
 
 @triton.jit
 def _low(x, n):
-    """Return the node below a place along an axis of n nodes, within the grid, and the distance beyond it."""
     inside = tl.minimum(tl.maximum(x, 0.0), (n - 1).to(tl.float32))
     first = tl.maximum(tl.minimum(tl.floor(inside), (n - 2).to(tl.float32)), 0.0)
     return first.to(tl.int32), inside - first, x - inside
@@ -82,7 +80,7 @@ def _low(x, n):
 
 @triton.jit
 def grid_distance(x, numbers, table, mask, OPTIONS: tl.constexpr):
-    """Trilinear interpolation; beyond the grid, the value at its border plus the distance to it.
+    """Distance interpolated in a grid; beyond the grid, the value at its border plus the distance to it.
 
     ``numbers``: first node (3), axes in columns (9), spacing, nodes along each axis (3). ``table``: the distances.
     """
@@ -128,7 +126,7 @@ class DistanceGrid:
     spacing: float
 
     def numbers(self, axes: Tensor) -> Tensor:
-        """Those of :func:`grid_distance`, shape (16,), with the axes in columns."""
+        """The ``numbers`` of :func:`grid_distance`, shape (16,), with the axes in columns."""
         sizes = [self.origin.new_full((1,), size) for size in (self.spacing, *self.values.shape)]
         return torch.cat([self.origin, axes.to(self.origin).reshape(-1), *sizes])
 
@@ -138,7 +136,7 @@ class DistanceGrid:
 
 
 def distance_at(function: Any, place: Tensor, numbers: Tensor, table: Tensor) -> tuple[Tensor, Tensor]:
-    """A device function of this file on tensors: distances (...) and unit gradients (..., 3) at places (..., 3)."""
+    """Evaluate a distance function on tensors: distances (...) and unit gradients (..., 3) at places (..., 3)."""
     known = tuple(numbers.to(place).reshape(-1).unbind())
     distance, normal = on_tensors(function)(place.unbind(-1), known, Memory(table.to(place)), None, ())
     return distance, vectors(normal)

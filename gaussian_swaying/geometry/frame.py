@@ -46,7 +46,7 @@ class SimFrame:
 
     @property
     def turns(self) -> bool:
-        """True if the axes differ from those of the scene, which is so unless z is up in the scene."""
+        """True if scene axes and simulation axes differ, that is, unless z is up in the scene."""
         if not self._turns:
             self._turns.append(not torch.equal(self.rotation, torch.eye(3).to(self.rotation)))
         return self._turns[0]
@@ -64,7 +64,6 @@ class SimFrame:
 
         Args:
             points: Points of the object in scene units, shape (N, 3).
-            up: Direction in the scene that points up.
             longest_side: Longest side of the object's box, along the simulation axes [m]; PhysGaussian's normalisation
                 is 1. Excludes ``metres_per_unit``.
             metres_per_unit: Length of a scene unit [m]; 1 if neither is given.
@@ -152,7 +151,6 @@ class SimFrame:
         return eye + ((F - eye).flatten(-2) @ both).unflatten(-1, (3, 3))  # one product, not two of small matrices
 
     def describe(self) -> str:
-        """One line of text that helps to place boxes and cameras."""
         origin = [round(v, 4) for v in self.origin.tolist()]
         up = [round(v, 3) for v in self.rotation[2].tolist()]
         return f"1 scene unit = {self.metres_per_unit:.6g} m; origin {origin}; up {up} (scene units)"

@@ -62,7 +62,7 @@ def sums(values: Tensor, group: Tensor, count: int | None = None) -> Tensor:
 
 
 def once(pairs: Tensor, count: int) -> Tensor:
-    """Pairs of different items in either order and more than once, each once, sorted.
+    """Sorted pairs without duplicates, whatever the order of the two.
 
     Args:
         pairs: Their numbers, int64, shape (K, 2).

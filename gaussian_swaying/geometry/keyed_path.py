@@ -56,7 +56,7 @@ class KeyedPath:
                 check_vector(name, key)
 
     def keys(self, frame: SimFrame | None = None) -> Tensor:
-        """What :func:`pose` reads [s, m, rad], float64, shape (K + 1, 7); in metres if a frame is given."""
+        """Rows for :func:`pose` [s, m, rad], float64, shape (K + 1, 7); converted to metres if a frame is given."""
         times = torch.tensor(self.times, dtype=torch.float64)[:, None]
         moves, turns = (_vectors(keys, len(times)) for keys in (self.moves, self.turns))
         turns = torch.deg2rad(turns)
@@ -78,7 +78,7 @@ def _vectors(keys: Sequence[Sequence[float]], count: int) -> Tensor:
 
 
 def fastest(times: Tensor, values: Tensor, start: float = -math.inf, end: float = math.inf) -> float:
-    """Largest rate of values (K, 3) between keys, over the intervals that overlap the time from start to end [s]."""
+    """Largest rate of change of values (K, 3) between keys, over intervals that overlap [start, end] [s]."""
     if len(times) < 2:
         return 0.0
     meets = (times[1:] > start) & (times[:-1] < end)
@@ -93,7 +93,7 @@ def keys_before(keys: Tensor, time: Tensor) -> Tensor:
 
 
 def picked(values: Tensor, index: Tensor) -> Tensor:
-    """Rows of a tensor (N, ...) by integers of any shape, also of none, without making the host wait.
+    """Index a tensor (N, ...) with an integer tensor of any shape, without a GPU synchronisation.
 
     ``values[index]`` with a scalar on a GPU would read it on the host, which a CUDA graph cannot record.
     """
@@ -102,7 +102,7 @@ def picked(values: Tensor, index: Tensor) -> Tensor:
 
 @triton.jit
 def pose(keys, k, t):
-    """Displacement and rotation, twelve numbers, at times t from the k-th key on, linear to the next one.
+    """Displacement and rotation (twelve numbers) at times t, interpolated after the k-th key.
 
     ``keys`` has rows of the time, the displacement and the turn; the last is followed by a later one that is the same.
     """
@@ -116,7 +116,7 @@ def pose(keys, k, t):
 
 @triton.jit
 def rigid_motion(keys, k, later, t, dt, centre):
-    """Centre and rotation at times t, and the velocity of what is at an offset: a matrix times it, and a vector.
+    """Centre and rotation at times t, and the velocity field: a matrix times the offset, plus a vector.
 
     It takes each place to where it is ``dt`` later; k and ``later`` are the keys before both times.
     """

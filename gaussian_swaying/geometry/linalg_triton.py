@@ -298,7 +298,6 @@ def _ordered(bp, bq, vp, vq):
 
 @triton.jit
 def _unit(vector, fallback):
-    """A vector of length one; where it vanishes, the fallback."""
     squared = dot3(vector, vector)
     scale = 1.0 / tl.sqrt(tl.maximum(squared, 1e-31))
     return where3(squared > 1e-31, scale3(scale, vector), fallback)

@@ -115,7 +115,6 @@ def _deform(
     F, covariance, normal, solid, covariance_out, normal_out, rotation_out, square, count,
     TURN: tl.constexpr, LIMIT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """One patch per lane."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = index < count
     f = load9(F, 1, 9 * index, mask)

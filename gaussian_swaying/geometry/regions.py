@@ -51,7 +51,7 @@ class Region(Fixed, ABC):
         return {name: value for name, value in vars(self).items() if name != "_known"}
 
     def on(self, points: Tensor, values: Sequence[float]) -> Tensor:
-        """Numbers of the region as a tensor with the type and device of some points.
+        """Constants of the region as a tensor with the dtype and device of some points.
 
         They are cached as long as the region lives, so that later calls copy nothing to a GPU and a recorded CUDA graph
         never reads freed memory.
@@ -77,7 +77,7 @@ class Region(Fixed, ABC):
         raise ValueError(f"A {type(self).__name__} is not the shape of an obstacle: use a Box or Capsule.")
 
     def bounds(self, points: Tensor) -> tuple[list[float], list[float]]:
-        """Smallest and largest coordinates of points (..., 3), in the axes and units in which the region is given."""
+        """Smallest and largest coordinates of points (..., 3), in the region's axes and units."""
         flat = points.detach().reshape(-1, 3).double()
         low, high = ([round(v, 4) for v in corner.tolist()] for corner in (flat.amin(0), flat.amax(0)))
         return low, high
@@ -306,7 +306,6 @@ class StillGaussians(Region):
         return axes[0, :0], axes[:0]
 
     def contains(self, points: Tensor) -> Tensor:
-        """Refuse."""
         raise ValueError("StillGaussians are the shape of an obstacle, not a region.")
 
 

@@ -50,7 +50,7 @@ def rigid_velocity(place: Tensor, velocity: Tensor, mass: Tensor, dt: float | Te
 
 
 def fitted_gradient(rest: Tensor, field: Tensor, mass: Tensor) -> Tensor:
-    """The gradient of the affine function of the places at rest that is closest to a field.
+    """Gradient of the affine fit to a field, by weighted least squares.
 
     Args:
         rest: Places at rest [m], shape (..., K, 3), not all in a plane.

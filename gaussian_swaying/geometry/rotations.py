@@ -14,9 +14,6 @@ from gaussian_swaying._checks import check_vector
 def quat_to_rotation(quats: Tensor) -> Tensor:
     """Rotation matrices of quaternions.
 
-    Args:
-        quats: Quaternions wxyz of any length above zero, shape (..., 4).
-
     Returns:
         Shape (..., 3, 3); columns are the axes of the Gaussian.
     """

@@ -22,12 +22,12 @@ from gaussian_swaying.simulation.model import CENTER, rotation_matrix
 
 
 def tidy(vector: Tensor) -> list[float]:
-    """Numbers without round-off from a rotation, and without -0."""
+    """Round numbers from a rotation, without -0."""
     return [round(v, 12) + 0.0 for v in vector.tolist()]
 
 
 def heading(rotation: Tensor) -> Tensor:
-    """Turned axes to the axes of the simulation, which differ by a rotation about z; shape (3, 3), float64."""
+    """Rotation about z from turned axes to those of the simulation; shape (3, 3), float64."""
     return rotation_from_z(tidy(rotation[2])).T @ rotation.T
 
 
@@ -177,7 +177,7 @@ RESET_SUBSTEPS = 15
 
 @dataclass(frozen=True)
 class Turned:
-    """Values that boundaries need.
+    """The normalised space of a PhysGaussian configuration, as its boundaries need it.
 
     Args:
         turn: Rotation from turned to simulation axes, shape (3, 3).
@@ -387,7 +387,7 @@ FILLING = (
 
 
 def filling_settings(take: Fields, n_grid: int, grid_lim: float) -> dict[str, Any]:
-    """``scene.filling``: another method for the same purpose, on a grid with the same spacing."""
+    """``scene.filling`` for PhysGaussian's particle filling: another method, on a grid with the same spacing."""
     spacing, wanted = grid_lim / take.whole("n_grid", 4 * n_grid), take.whole("max_partciels_per_cell", 1)
     unused = [name for name in FILLING if take.get(name, None) not in (None, False)]
     if unused:

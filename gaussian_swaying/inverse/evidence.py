@@ -84,25 +84,16 @@ def compare(
     evidence: Sequence[Evidence],
     values: Sequence[Values],
     times: Sequence[float],
-    careful: bool = True,
     moving: bool = False,
     tick: Tick = lambda count: None,
 ) -> Block:
-    """Simulate variants, and compare each with the videos.
+    """Simulate variants, and compare each with the videos at some times [s], ascending.
 
-    Args:
-        times: Times of the frames to compare [s], ascending.
-        careful: Take the same substeps for all. If not, or if one of them diverges, each variant takes its own, and may
-            end in NaN.
-        moving: Whether the videos begin in motion; their first frame is then compared, too.
-        tick: Called after every frame.
-
-    Returns:
-        Residuals of all cameras and times.
+    All take the same substeps, unless one of them diverges. The first frame is compared if the videos begin in motion.
     """
     wanted = [(time, [(0, time)] if time > 0 or moving else []) for time in times]  # at rest all variants are alike
     try:
-        return _compared(simulation, evidence, values, wanted, 1, careful, tick)[0]
+        return _compared(simulation, evidence, values, wanted, 1, True, tick)[0]
     except SimulationDiverged:
         return _compared(simulation, evidence, values, wanted, 1, False, tick)[0]
 
@@ -117,8 +108,7 @@ def compare_starts(
 ) -> list[Block]:
     """Compare variants as if each had begun to move at each of some times of the film, from one simulation of each.
 
-    The arguments are those of :func:`compare`, in a wind that does not depend on time, and times at which the motion
-    begins [s]. For each of these, the residuals of all variants, also of the first frame; NaN for one that diverged.
+    For each of these, in a wind that does not depend on time, the residuals of all variants, also of the first frame.
     """
     wanted: dict[int, list[tuple[int, float]]] = {}  # what is compared with a state, by its time [microseconds]
     for number, start in enumerate(starts):
@@ -181,34 +171,33 @@ def explained(
     values: Values,
     times: Sequence[float],
 ) -> dict[str, float]:
-    """The share of the motion of tracks that were not fitted which a simulation explains, by camera."""
-    parts = [Evidence(simulation, video, held_out(own)) for video, own in zip(videos, tracks, strict=True)]
-    left, moved = dict.fromkeys((video.name for video in videos), 0.0), dict.fromkeys((v.name for v in videos), 0.0)
+    """The share of the motion of tracks that were not fitted which a simulation explains, by camera, 0 to 1.
+
+    A track that slipped off the object may be many times as far away as the object moves, and explains nothing, no
+    less: one of them would decide the sum of all.
+    """
+    parts = [Evidence(simulation, video, split(own)[1]) for video, own in zip(videos, tracks, strict=True)]
+    sums = [torch.zeros(2, len(part.rest), dtype=torch.float64) for part in parts]
     for number, frame, pixel in _pixels(simulation, parts, values, times):
         part = parts[number]
         seen = part.tracks.seen[frame]
-        there, name = part.tracks.position[frame, seen], part.video.name
-        off = (pixel[seen] - there).square().sum(-1) - NOISE**2
-        left[name] += float(off.clamp(min=0).sum())
-        moved[name] += float((there - project(part.rest[seen], part.video.cameras[frame])[0]).square().sum())
-    return {name: 1 - left[name] / all_of_it for name, all_of_it in moved.items() if all_of_it > 0}
+        there = part.tracks.position[frame, seen]
+        rest = project(part.rest[seen], part.video.cameras[frame])[0]
+        left = ((pixel[seen] - there).square().sum(-1) - NOISE**2).clamp(min=0).nan_to_num(torch.inf)
+        sums[number][:, seen] += torch.stack([left, (there - rest).square().sum(-1)])
+    return {
+        part.video.name: 1 - float(torch.minimum(left, moved).sum() / moved.sum())
+        for part, (left, moved) in zip(parts, sums, strict=True)
+        if bool(moved.any())
+    }
 
 
-def _held(tracks: Tracks) -> Tensor:
-    """Mask of the tracks that are not fitted, but judge the fit; none if there are too few."""
+def split(tracks: Tracks) -> tuple[Tracks, Tracks]:
+    """The tracks that are fitted, and those that judge the fit; all of them for both if there are too few."""
     held = tracks.index % HELD == 0
-    return held if int(held.sum()) >= LEAST_HELD else torch.zeros_like(held)
-
-
-def fitted_part(tracks: Tracks) -> Tracks:
-    """The tracks that are fitted."""
-    return replace(tracks, seen=tracks.seen & ~_held(tracks))
-
-
-def held_out(tracks: Tracks) -> Tracks:
-    """The tracks that were not fitted; all if there are too few."""
-    held = _held(tracks)
-    return replace(tracks, seen=tracks.seen & held) if bool(held.any()) else tracks
+    if int(held.sum()) < LEAST_HELD:
+        return tracks, tracks
+    return replace(tracks, seen=tracks.seen & ~held), replace(tracks, seen=tracks.seen & held)
 
 
 def trusted(

@@ -19,7 +19,7 @@ from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.grouping import connected_parts
 from gaussian_swaying.geometry.neighbours import particle_spacing
 from gaussian_swaying.inverse.registration import SOLID, in_space, off_camera
-from gaussian_swaying.inverse.tracks import follow, opencv
+from gaussian_swaying.inverse.tracks import corners, follow, opencv
 from gaussian_swaying.inverse.videos import Footage, check_wide, frames_of, next_of, scaled
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.protocol import RenderOutput
@@ -125,11 +125,9 @@ def view_of_focal(millimetres: float, width: int, height: int) -> float:
 
 
 class Points:
-    """Points of a splat in the first frame of a film, at rest, and points around it, which tell how a hand shakes.
+    """Points of a splat in the grey first frame of a film, at rest, and points around it, which tell how a hand shakes.
 
-    Args:
-        grey: The first frame, dtype uint8, NumPy array (H, W).
-        picture: The splat, drawn from the camera of the first frame, perhaps larger.
+    The splat is drawn from the camera of the first frame, perhaps larger.
 
     Attributes:
         start: All of them, of the splat first [pixels], shape (T, 2).
@@ -143,8 +141,7 @@ class Points:
         alpha = picture.alpha[..., 0].detach().cpu().numpy()
         cover = (cv2.resize(alpha, grey.shape[::-1], interpolation=cv2.INTER_AREA) > SOLID).astype(np.uint8)
         around = (cv2.dilate(cover, np.ones((15, 15), np.uint8)) == 0).astype(np.uint8)
-        corners = [cv2.goodFeaturesToTrack(grey, 600, 0.01, 4, mask=mask) for mask in (cover, around)]
-        own, beside = (np.zeros((0, 2)) if one is None else one.reshape(-1, 2) + 0.5 for one in corners)
+        own, beside = (corners(grey, 600, 0.01, 4, mask) for mask in (cover, around))
         self.start, self._count = np.concatenate([own, beside]), len(own)
         self.full = len(beside) < LEAST_SHAKEN and cover.mean() > FULL
         self.world, self.known = in_space(picture, camera, own * scale)
@@ -179,13 +176,9 @@ class Points:
 
 
 def begins_to_move(film: Film, picture: RenderOutput, camera: Camera) -> float | None:
-    """Time of the first frame in which the object is not as in the first one [s]; None if there is none.
+    """Time of the first frame in which the object is not as in the first one, at rest [s]; None if there is none.
 
-    A hand that shakes moves the background, too, and does not count.
-
-    Args:
-        film: The film; the object is at rest in its first frame.
-        picture: The splat, drawn from the camera of the first frame.
+    A hand that shakes moves the background, too, and does not count. The splat is drawn from the camera of that frame.
     """
     import numpy as np
 
@@ -225,33 +218,11 @@ def _differs(first: Any, grey: Any, where: Any) -> bool:
     return bool((abs(level - before) > DIFFERENT).mean() > MOVED_SHARE)
 
 
-@dataclass(frozen=True)
-class HeldEnd:
-    """The end that does not move.
+def held_end(places: Tensor, moved: Tensor, up: Sequence[float]) -> tuple[str, float, float] | None:
+    """Find the end of an object that moves least in a film, from how far points (T, 3) of it go, (T,) [pixels].
 
-    Attributes:
-        name: ``top``, ``bottom``, or ``+x`` to ``-z`` of the splat.
-        direction: Towards it, shape (3,).
-        moves: How far points there move [pixels].
-        others: How far the liveliest quarter moves [pixels].
-    """
-
-    name: str
-    direction: tuple[float, ...]
-    moves: float
-    others: float
-
-
-def held_end(places: Tensor, moved: Tensor, up: Sequence[float]) -> HeldEnd | None:
-    """Find the end of an object that moves least in a film.
-
-    Args:
-        places: Of points on the object, shape (T, 3).
-        moved: How far each goes [pixels], shape (T,).
-        up: Direction that is up, shape (3,).
-
-    Returns:
-        None if no end is much more still than the rest, as in an object that is held at a corner or within.
+    Its name, ``top``, ``bottom``, or ``+x`` to ``-z`` of the splat, and how far it and the liveliest quarter of the
+    points go. None if no end is much more still than the rest, as in an object that is held at a corner or within.
     """
     if len(moved) < 4 * FEWEST or (others := float(moved.quantile(0.75))) < LEAST_MOTION:
         return None
@@ -271,18 +242,13 @@ def held_end(places: Tensor, moved: Tensor, up: Sequence[float]) -> HeldEnd | No
     if not found or min(found)[0] > STILL * others:
         return None
     moves, name = min(found)
-    return HeldEnd(name, tuple(ends[name].tolist()), moves, others)
+    return name, moves, others
 
 
 def moving_box(places: Tensor, moved: Tensor, cloud: GaussianCloud) -> tuple[Tensor, Tensor] | None:
-    """The box of what moves among things that do not, and of all that is connected with it.
+    """Corners (3,) of the box of what moves, and of all that is connected with it, from how far points (T, 3) go, (T,).
 
-    Args:
-        places: Of points that the film shows, shape (T, 3).
-        moved: How far each goes [pixels], shape (T,).
-
-    Returns:
-        Lower and upper corner [scene units], shape (3,); None if most of what is seen moves, or hardly anything.
+    None if most of what is seen moves, or hardly anything.
     """
     goes = moved > max(LEAST_MOTION, LIVELY * float(moved.quantile(0.98))) if len(moved) else moved > 0
     if not 4 * FEWEST <= int(goes.sum()) <= MOST * len(goes):
@@ -300,15 +266,10 @@ def moving_box(places: Tensor, moved: Tensor, cloud: GaussianCloud) -> tuple[Ten
 
 
 def moving_points(video: Footage, picture: RenderOutput) -> tuple[Tensor, Tensor]:
-    """Follow points of a splat through a film, and take the shake of a hand off.
+    """Follow points of a splat through a film that begins at rest, and take the shake of a hand off.
 
-    Args:
-        video: The film; the object is at rest in its first frame.
-        picture: The splat, drawn from the camera of the first frame.
-
-    Returns:
-        The places in the splat of those that are seen for half of the film, (T, 3), and how far each goes at most, (T,)
-        [pixels].
+    The places in the splat of those that are seen for half of the film, (T, 3), and how far each goes at most, (T,)
+    [pixels]. The splat is drawn from the camera of the first frame.
     """
     import numpy as np
 

@@ -28,19 +28,16 @@ from gaussian_swaying.inverse.evidence import (
     compare_starts,
     distrust,
     explained,
-    fitted_part,
+    split,
     trusted,
 )
 from gaussian_swaying.inverse.hand import Judged, prepared
 from gaussian_swaying.inverse.least_squares import (
-    NO_STEP,
     Block,
     DivergedError,
-    Normal,
     Residuals,
     Solved,
     cost_of,
-    expected_gain,
     linearised,
     solve,
     step_from,
@@ -61,9 +58,7 @@ from gaussian_swaying.inverse.rivals import is_mirrored, mirrored_place
 from gaussian_swaying.inverse.tracks import Tracks, beside_rest, match, opencv, still_until, track
 from gaussian_swaying.inverse.unknowns import (
     FILM_START,
-    Unknown,
     apart_by,
-    changes,
     check_apart,
     check_unknowns,
     directions,
@@ -79,35 +74,23 @@ from gaussian_swaying.simulation.simulation import Simulation
 PROGRESS = "fit.json"
 OURS = (PROGRESS, "page.html", "values.csv", "result.json", "scene.yaml", PICTURES)
 
-FAR, GAIN = 0.005, 0.003
-"""Step, as a share of a range, and least expected relative decrease of the cost by it, above which the values have not
-settled."""
+UNSETTLED = "The values have not settled: `iterations` ran out: raise it and continue with --resume."
 
-STEPS = (
-    ("tracks", 0.25),
-    ("tracks", 0.5),
-    ("matches", 0.5),
-    ("matches", 0.5),
-    ("matches", 0.75),
-    ("matches", 1.0),
-    ("matches", 1.0),
-)
-"""What is compared in each step, and the share of the fitted frames that it takes: Gaussians that were followed from
-frame to frame, then those that are matched from rendered frames to frames of the video.
+FOLLOWED = (0.25, 0.5)
+"""Shares of the fitted frames in which points are followed from frame to frame, from each start.
 
 Chaos grows with time: in a flapping flag, a change of Young's modulus by a hundredth makes pixels of difference
 within two seconds, and over the whole video the cost has local minima far from the global one. So the first horizon is
 the shortest time that determines the unknowns, and its solution must be exact before time is added."""
 
-TRUSTED = 0.5
-"""Share of the fitted frames from which other grids tell which points to trust."""
+STEPS = (0.5, 0.5, 0.75, 1.0, 1.0)
+"""Then shares in which Gaussians are matched from rendered frames to frames of the video, one after the other."""
 
 STARTS = 3
 """Starts that the search gives to short solves."""
 
-SEARCHED, NEAR = 0.5, 0.1
-"""Share of the fitted frames that the coarse search looks at, and standard deviation of its second part, as a share of
-the ranges."""
+SEARCHED = 0.5
+"""Share of the fitted frames that the coarse search looks at."""
 
 COARSE = 0.02
 """Standard deviation of residuals in the coarse search, per the width of a picture."""
@@ -115,7 +98,7 @@ COARSE = 0.02
 LONG_STILL = 0.05
 """Longest time that a film may be still, if the start of its motion is no unknown [s]."""
 
-SPREAD = ("wind.speed", "wind.azimuth")
+SPREAD = ("wind.speed", "wind.azimuth", "material.E")
 """Unknowns whose starts are spread over their ranges although one was given."""
 
 APART, SAME = 0.15, 0.03
@@ -166,15 +149,14 @@ class Say:
 
 @dataclass
 class Course:
-    """The resume state of a fit, as ``fit.json`` stores it.
+    """The resume state of a fit, as ``fit.json`` stores it; places are shares of the ranges.
 
     Attributes:
         step: Number of the step, of :data:`STEPS`; -1 before the end of the search.
-        starts: Places that the search found, as shares of their ranges.
-        place: Values of the unknowns, as shares of their ranges.
-        first: Values (as shares) whose simulation the first frame looks like; empty if it shows the scene at rest.
-        rivals: Where other starts ended, as shares, to be compared with the end.
-        matched: Values (as shares) at which the current step began, and Gaussians were matched; empty before it.
+        starts: Places that the search found.
+        first: The place whose simulation the first frame looks like; empty if it shows the scene at rest.
+        rivals: Where other starts ended, to be compared with the end.
+        matched: The place at which the current step began, and Gaussians were matched; empty before it.
         rounds: How often it went on from another end.
         tried: Steps that the solve of the last step has tried.
         ended: The reason why it ended; empty if it did not.
@@ -198,17 +180,9 @@ class Problem:
     """The unknowns of a simulation, and the videos from which they are found.
 
     Args:
-        simulation: The base, with all that is known.
-        videos: From :func:`~gaussian_swaying.inverse.videos.read_videos`.
-        plan: The unknowns, and how to find them.
-        say: Called with a line for each thing that is done.
-        on_grid: Makes the simulation with cells so many times as large, to know what the grid does to the values; None
-            to leave that.
+        grids: The simulation on other grids, which tell what the grid does to the values.
         judged: What the background said of the videos, see :func:`~gaussian_swaying.inverse.hand.prepared`.
         looked: Sentences on cameras that are not where they are said to be.
-
-    Raises:
-        ValueError: If the plan does not fit the simulation or the videos.
     """
 
     def __init__(
@@ -218,13 +192,13 @@ class Problem:
         plan: Plan,
         say: Say | None = None,
         judged: Sequence[Judged] = (),
-        on_grid: Callable[[float], Simulation] | None = None,
+        grids: Sequence[Simulation] = (),
         looked: Sequence[str] = (),
     ) -> None:
         check_unknowns(simulation, plan.unknowns)
         self.simulation, self.videos, self.plan = simulation, list(videos), plan
         self.say, self.judged = say or Say(False), tuple(judged)
-        self.on_grid, self.looked = on_grid, list(looked)
+        self.grids, self.looked = grids, list(looked)
         self.times = frame_times(videos)
         fitted = max(3, round(0.5 * len(self.times)))
         if plan.until is not None:
@@ -234,11 +208,11 @@ class Problem:
         self.fitted = self.times[:fitted]
         check_variants(simulation)
         self.sought = {unknown.name: k for k, unknown in enumerate(plan.unknowns)}
+        self.middle = [0.5 if u.start is None else u.share(u.start) for u in plan.unknowns]
         self.begins = plan.unknowns[self.sought[FILM_START]] if FILM_START in self.sought else None
         self.moving = self.begins is not None and self.begins.low < 0
         self.first: list[float] = []
         self._tracks: list[Tracks] | None = None
-        self._other_grids: list[Simulation] | None = None
         for video in self.videos:  # all cameras have to see the start of the motion, or a state before it
             begin, step = video.times[0], (video.times[-1] - video.times[0]) / max(len(video.times) - 1, 1)
             if begin > max([1.5 * step, *([self.begins.low] if self.begins else [])]):
@@ -297,34 +271,20 @@ class Problem:
                     found.append((sum(int(own.seen[0].sum()) for own in tracks), place))
         return max(found, key=itemgetter(0))[1]
 
-    def evidence(self, kind: str, matched: Sequence[float] = ()) -> list[Evidence]:
-        """What each video shows: ``tracks``, or ``matches`` that are made at a place."""
-        tracks = self.tracks if kind == "tracks" else []
-        if kind == "matches":
+    def evidence(self, matched: Sequence[float] | None = None) -> list[Evidence]:
+        """What each video shows: points that are followed, or that are matched at a place."""
+        tracks = self.tracks if matched is None else []
+        if matched is not None:
             states = dict(zip(self.fitted, self._states(matched, self.fitted), strict=True))
             for video in self.videos:
                 own = [state for moment, state in states.items() if video.frame_at(moment) is not None]
                 tracks = [*tracks, match(self.simulation, video, own, self.plan.tracks, self.moving)]
         pairs = zip(self.videos, tracks, strict=True)
-        return [Evidence(self.simulation, video, fitted_part(own)) for video, own in pairs]
+        return [Evidence(self.simulation, video, split(own)[0]) for video, own in pairs]
 
     def trusted(self, evidence: Sequence[Evidence], place: Sequence[float]) -> list[Evidence]:
         """The evidence, with less trust where other grids show something else at a place."""
-        return trusted(self.simulation, self.grids(), evidence, self.values(place), self.fitted)
-
-    def grids(self) -> list[Simulation]:
-        """The simulation on other grids."""
-        if self._other_grids is None:
-            self._other_grids = []
-            for ratio in GRIDS if self.on_grid else ():
-                try:
-                    with warnings.catch_warnings():  # of an object of few cells
-                        warnings.simplefilter("ignore")
-                        self._other_grids.append(self.on_grid(ratio))  # type: ignore[misc]
-                except ValueError as error:
-                    told = f"cells {ratio:g} times as large, to know the error of the grid, are not possible: {error}"
-                    self.say(told)
-        return self._other_grids
+        return trusted(self.simulation, self.grids, evidence, self.values(place), self.fitted)
 
     def _states(self, place: Sequence[float], times: Sequence[float]) -> list[State]:
         return [own[0] for own in states_of(self.simulation, [self.values(place)], times, alike=False)]
@@ -338,7 +298,7 @@ class Problem:
 
         def at(places: Tensor) -> Block:
             values = [self.values(place) for place in places]
-            return compare(self.simulation, evidence, values, times, moving=self.moving, tick=self.say.tick)
+            return compare(self.simulation, evidence, values, times, self.moving, self.say.tick)
 
         return at
 
@@ -353,13 +313,13 @@ class Problem:
     # ---- the steps
 
     def search(self) -> list[list[float]]:
-        """Return the best starts of a coarse search: Sobol's sequence over the ranges, then draws around the best.
+        """Return the best starts of a coarse search: Sobol's sequence over the ranges.
 
         Coefficients and damping stay in the middle of their ranges, and what has a ``start`` stays there, but for
         :data:`SPREAD`. Values that were given are the first start. Simulations of similar stiffness are one batch.
         """
         unknowns, plan = self.plan.unknowns, self.plan
-        begin = torch.tensor([[0.5 if u.start is None else u.share(u.start) for u in unknowns]], dtype=torch.float64)
+        begin = torch.tensor([self.middle], dtype=torch.float64)
         given = any(u.start is not None for u in unknowns)
         sought = [u for u in unknowns if u.start is None or u.name in SPREAD]
         free = [self.sought[u.name] for u in sought if not u.name.startswith(("aero.", "solver."))]
@@ -367,59 +327,39 @@ class Problem:
             if self.moving:
                 self.begin_at(begin[0].tolist())
             return begin.tolist()
-        places = begin.repeat(max(1, 3 * plan.search // 4), 1)
+        places = begin.repeat(plan.search, 1)
         places[:, free] = torch.quasirandom.SobolEngine(len(free), scramble=True, seed=0).draw(len(places)).double()
         if self.moving:
             self.begin_at(self.begin_from(places[:BEGUN]))
-        shape = plan.search - 3 * plan.search // 4, len(free)
-        shift = NEAR * torch.randn(shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-
-        evidence, times = self.evidence("tracks"), self._until(SEARCHED)
-        with self.say.work("search", (given + plan.search) * len(times)):
-            places, costs = self._coarse(torch.cat([begin[: int(given)], places]), evidence, times)
-            if len(shift):
-                near = places[int(costs.argmin())].repeat(len(shift), 1)
-                near[:, free] = (near[:, free] + shift).clamp(0.02, 0.98)
-                near, more = self._coarse(near, evidence, times)
-                places, costs = torch.cat([places, near]), torch.cat([costs, more])
+        if given:
+            places = torch.cat([begin, places])
+        evidence, times, known = self.evidence(), self._until(SEARCHED), self.begins
+        starts = [0.0 if known is None or known.start is None else known.start]
+        if known is not None and known.start is None:  # in a steady wind one simulation shows what any start would
+            step = max(times[1] - times[0], (known.high - known.low) / MOST_STARTS)
+            numbers = range(math.ceil(known.low / step), math.floor(known.high / step) + 1)
+            starts = [step * k for k in numbers] or [known.low]
+        values, scale = [self.values(place) for place in places], COARSE * max(video.size[0] for video in self.videos)
+        with self.say.work("search", len(places) * len(times)):
+            found = compare_starts(self.simulation, evidence, values, times, starts, self.say.tick)
+        costs, best = torch.stack([cost_of(block, scale) for block in found]).min(0)
+        if known is not None:
+            places[:, self.sought[FILM_START]] = torch.tensor([known.share(start) for start in starts]).double()[best]
         if not bool(torch.isfinite(costs).any()):
             raise DivergedError("Every simulation of the coarse search diverged: narrow the ranges of `unknowns`.")
-        found = places[:1].tolist() if given else []
+        ends = places[:1].tolist() if given else []
         for place in places[costs.argsort()].tolist():
-            apart = all(apart_by(unknowns, place, other) > APART for other in found)
-            if len(found) < STARTS and apart:
-                found.append(place)
-        return found
-
-    def _coarse(self, places: Tensor, evidence: Sequence[Evidence], times: Sequence[float]) -> tuple[Tensor, Tensor]:
-        """Return the places with the best start of the motion for each, and their costs.
-
-        In a steady wind one simulation shows what any start would.
-        """
-        scale = COARSE * max(video.size[0] for video in self.videos)
-        values, known, tick = [self.values(place) for place in places], self.begins, self.say.tick
-        if known is None or known.start is not None:
-            return places, cost_of(compare(self.simulation, evidence, values, times, False, self.moving, tick), scale)
-        step = max(times[1] - times[0], (known.high - known.low) / MOST_STARTS)
-        numbers = range(math.ceil(known.low / step), math.floor(known.high / step) + 1)
-        starts = [step * k for k in numbers] or [known.low]
-        found = compare_starts(self.simulation, evidence, values, times, starts, tick)
-        costs, best = torch.stack([cost_of(block, scale) for block in found]).min(0)
-        places = places.clone()
-        shares = torch.tensor([known.share(start) for start in starts], dtype=places.dtype)
-        places[:, self.sought[FILM_START]] = shares[best]
-        return places, costs
+            if len(ends) < STARTS and all(apart_by(unknowns, place, other) > APART for other in ends):
+                ends.append(place)
+        return ends
 
     def best_of(self, places: Sequence[Sequence[float]]) -> list[list[float]]:
         """Solve from several starts for a short while, and return the best end, and others with nearly its cost.
 
         Horizons grow, and at each the worse half is left.
         """
-        ended, costs, left = [list(place) for place in places], [0.0], len(places)
-        if left < 2:
-            return ended
-        evidence = self.evidence("tracks")
-        for share in (share for kind, share in STEPS if kind == "tracks"):
+        ended, costs, left, evidence = [list(place) for place in places], [0.0], len(places), self.evidence()
+        for share in FOLLOWED:
             times = self._until(share)
             ended, costs = self._brief(ended[:left], evidence, times)
             for place, cost in zip(ended, costs, strict=True):
@@ -441,7 +381,7 @@ class Problem:
                 own, shown = copy(self), evidence
                 if shown is None:
                     own.begin_at(place)
-                    shown = own.trusted(own.evidence("tracks"), place)
+                    shown = own.trusted(own.evidence(), place)
                 found.append(own.solved(place, shown, times, BRIEF, False))
                 more.append(distrust(shown, times) if evidence is None else 0.0)
         if not found:
@@ -467,7 +407,7 @@ class Problem:
         if not tried:
             return [], []
         try:
-            evidence = None if self.moving else self.trusted(self.evidence("tracks"), place)
+            evidence = None if self.moving else self.trusted(self.evidence(), place)
             ended, costs = self._brief([list(place), *tried], evidence, self.fitted)
         except DivergedError:
             return [], []
@@ -483,13 +423,12 @@ class Problem:
 
     def expected(self) -> str:
         """What the fit will take, in words, from the time of one simulation; and a coarser grid if that is long."""
-        middle = [0.5 if u.start is None else u.share(u.start) for u in self.plan.unknowns]
-        batch, begin = 2 + 2 * len(middle), 0.0
+        batch, begin = 2 + 2 * len(self.sought), 0.0
         for times in (self.fitted[:2], self.fitted):  # the first time compiles
             begin = time.monotonic()
-            for _ in states_of(self.simulation, [self.values(middle)] * batch, times):
+            for _ in states_of(self.simulation, [self.values(self.middle)] * batch, times):
                 pass
-        count = SEARCHED * self.plan.search + 3 * batch * sum(share for _, share in STEPS)
+        count = SEARCHED * self.plan.search + 3 * batch * sum(STEPS)
         count += BRIEF * batch * (STARTS + 3) + REFINED * batch * len(GRIDS)
         seconds = count * (time.monotonic() - begin) / batch
         told = f"about {count:.0f} simulations of {self.fitted[-1]:.3g} s: some {duration(seconds)}"
@@ -536,7 +475,7 @@ class Problem:
             if self.moving:
                 self.begin_at(better)
                 course.first = list(better)
-            course.step, course.matched = next(k for k, (_, share) in enumerate(STEPS) if share == 1), []
+            course.step, course.matched = STEPS.index(1.0), []
             course.tried, course.ended = 0, ""
             kept()
         result = self.result(course, evidence, films, others)
@@ -545,20 +484,17 @@ class Problem:
     def _stepped(self, course: Course, kept: Callable[[], None]) -> list[Evidence]:
         """Do the steps from that of the course on, and return the evidence of the last one."""
         for number in range(course.step, len(STEPS)):
-            (kind, share), last = STEPS[number], number == len(STEPS) - 1
-            times, course.matched = self._until(share), course.matched or list(course.place)
-            evidence = self.evidence(kind, course.matched)
-            if share >= TRUSTED:
-                evidence = self.trusted(evidence, course.matched)
+            times, last = self._until(STEPS[number]), number == len(STEPS) - 1
+            course.matched = course.matched or list(course.place)
+            evidence = self.trusted(self.evidence(course.matched), course.matched)
             left = self.plan.iterations - course.tried // TRIES
             if course.ended or left <= 0:  # it is continued after its end
                 return evidence
             found = self.solved(course.place, evidence, times, left, last)
             course.place = found.place.tolist()
-            row = {"compared": kind, "until": times[-1], "steps": found.steps, "cost": found.cost}
-            row |= {"ended": found.ended, "pixels": found.scale}
-            course.history.append(row | self.values(course.place))
-            self.say(f"{kind} to {times[-1]:.3g} s, {found.steps} steps: {self._shown(course.place)}")
+            row = {"until": times[-1], "steps": found.steps, "cost": found.cost, "ended": found.ended}
+            course.history.append(row | {"pixels": found.scale} | self.values(course.place))
+            self.say(f"matches to {times[-1]:.3g} s, {found.steps} steps: {self._shown(course.place)}")
             if last:
                 course.ended, course.tried = found.ended, course.tried + found.steps
             else:
@@ -578,15 +514,16 @@ class Problem:
             self.plan.unknowns,
             tuple(course.place),
             normal.covariance() + self.grid_covariance(place, evidence),
-            directions(normal.matrix, self.plan.unknowns, place),
             predictions(self.simulation, self.videos, self.times, len(self.fitted), moved, films),
             course.history,
             course.seconds,
-            unsettled(normal, place, self.plan.unknowns, course.ended),
+            "" if course.ended else UNSETTLED,
             tuple(self.notes()),
             explained(self.simulation, self.videos, self.tracks, values, self.fitted),
-            judged=self.judged,
-            rivals=rivals,
+            consequences(self.plan.assumed, values, self.simulation),
+            wind_seen(values, self.videos, self.simulation),
+            self.judged,
+            rivals,
         )
 
     def grid_covariance(self, place: Tensor, evidence: Sequence[Evidence]) -> Tensor:
@@ -596,7 +533,7 @@ class Problem:
         a linear step is often too short; that step counts where none lowers the cost.
         """
         found = torch.zeros(2 * (len(place),), dtype=torch.float64)
-        for other in self.grids():
+        for other in self.grids:
             own = [part.on(other) for part in evidence]
             there = copy(self)
             there.simulation = other
@@ -642,31 +579,14 @@ class Problem:
     def _check_apart(self, place: Sequence[float]) -> None:
         """Raise ValueError if the unknowns cannot be told apart at a place."""
         at = torch.tensor(place, dtype=torch.float64)
-        normal = linearised(self.residuals(self.evidence("tracks"), self.fitted), at)
+        normal = linearised(self.residuals(self.evidence(), self.fitted), at)
         found = directions(normal.matrix, self.plan.unknowns, at)
-        for direction in found:
-            self.say(f"sensitivity {direction.strength:9.3g}: {direction.sentence}")
+        for strength, _, told in found:
+            self.say(f"sensitivity {strength:9.3g}: {told}")
         check_apart(found, self.plan.unknowns, self.plan.limit)
 
     def _shown(self, place: Sequence[float]) -> str:
         return ", ".join(f"{name} {value:.5g}" for name, value in self.values(place).items())
-
-
-def unsettled(normal: Normal, place: Tensor, unknowns: Sequence[Unknown], ended: str) -> str:
-    """Return a sentence that says why the end of a fit is not a local minimum; empty if it is one.
-
-    The sentence names what the next Gauss-Newton step would change, and the remedy. A lower minimum elsewhere is not
-    detected. ``ended`` is the reason why the last steps ended; empty if their number ran out.
-    """
-    step = step_from(normal, place) - place
-    gain = expected_gain(normal, step)
-    if float(step.abs().amax()) <= FAR or gain <= GAIN:
-        return ""
-    why = {"": "`iterations` ran out", NO_STEP: "no step lowered the cost"}.get(ended, ended)
-    again = "raise `search`, or give a `start` that is nearer"
-    remedy = again if ended else "raise `iterations` and continue with --resume"
-    told = f"{changes(step.tolist(), unknowns, place)}, to lower the cost by {gain:.2g} of itself"
-    return f"The values have not settled: {why}, but the sensitivities ask for {told}: {remedy}."
 
 
 def run_fit(
@@ -692,8 +612,7 @@ def run_fit(
     begin, folder, parser = time.monotonic(), Path(output), Simulation.parser()
     settings = parse_base(plan, parser)
     problem = _ready(plan, parser, settings, device, progress)
-    simulation = problem.simulation
-    described = _described(plan, simulation)
+    described = _described(plan, problem.simulation)
     remedy = "choose another with --output"
     if resume and not (folder / PROGRESS).exists():
         raise ValueError(f"There is nothing to resume in {folder}: it has no {PROGRESS}; leave out --resume.")
@@ -714,10 +633,7 @@ def run_fit(
             if course.step < 0:  # it was refused before the first step: only pictures stay
                 (folder / PROGRESS).unlink(missing_ok=True)
             raise
-        told = consequences(plan.assumed, result.values, simulation, settings.solver.gravity)
-        seen = wind_seen(result.values, problem.videos, simulation)
-        result = replace(result, assumed=told, seen=seen)
-        write_results(folder, result, parser, settings, simulation)
+        write_results(folder, result, parser, settings, problem.simulation)
         write_page(folder, result)
         return result
     finally:
@@ -744,30 +660,25 @@ def _ready(plan: Plan, parser: Any, settings: Any, device: str, progress: bool) 
     own.camera = own.cameras = None  # the videos have their own
     simulation, say = Simulation.from_settings(parser, own), Say(progress)
     videos = read_videos(list(plan.videos), plan.cameras, simulation.scene.size, simulation.scene.model.origin)
-    looked = _looked(simulation, videos, plan)
+    moving = any(u.name == FILM_START and u.low < 0 for u in plan.unknowns)
+    looked = [told for video in videos for told in first_look(simulation, video, moving)]
     with say.work("the camera of each frame", sum(len(video.times) for video in videos)):
         videos, judged = prepared(simulation, videos, plan.hand_held, plan.also_moves, say, say.tick)
 
-    def on_grid(ratio: float) -> Simulation:
-        given = own.clone()
+    return Problem(simulation, videos, plan, say, judged, _other_grids(parser, own, say), looked)
+
+
+def _other_grids(parser: Any, settings: Any, say: Say) -> list[Simulation]:
+    found = []
+    for ratio in GRIDS:
+        given = settings.clone()
         given.solver.dx = ratio * given.solver.dx
-        return Simulation.from_settings(parser, given)
-
-    return Problem(simulation, videos, plan, say, judged, on_grid, looked)
-
-
-def _looked(simulation: Simulation, videos: Sequence[Footage], plan: Plan) -> list[str]:
-    """Sentences on cameras that are not where they are said to be; ValueError if a film does not show the splat."""
-    found, moving = [], any(u.name == FILM_START and u.low < 0 for u in plan.unknowns)
-    for video in videos:
-        shown, told = first_look(simulation, video)
-        if not shown and not moving:
-            raise ValueError(
-                f"The first frame of camera {video.name} does not show the splat where its camera looks: give a film "
-                "of this splat, or find its camera with `gaussian-swaying camera FILM SPLAT` (its places may be in "
-                f"another unit); if it begins in motion, add {FILM_START}: {{range: [-1, 0]}} to `unknowns`."
-            )
-        found += [told] if told else []
+        try:
+            with warnings.catch_warnings():  # of an object of few cells
+                warnings.simplefilter("ignore")
+                found.append(Simulation.from_settings(parser, given))
+        except ValueError as error:
+            say(f"cells {ratio:g} times as large, to know the error of the grid, are not possible: {error}")
     return found
 
 
@@ -794,12 +705,6 @@ def fit(
         device: ``auto``, ``cpu`` or ``cuda``.
         progress: Print a line for each step, and a bar.
         settings: Further fields of :class:`~gaussian_swaying.inverse.plan.Plan`, such as ``known`` and ``until``.
-
-    Returns:
-        Values with standard errors, what the video cannot tell apart, and the error of the predicted frames.
-
-    Raises:
-        ValueError: As :func:`run_fit`.
     """
 
     def names(given: Any) -> list[str]:

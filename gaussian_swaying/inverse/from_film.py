@@ -242,10 +242,9 @@ def _shown(seen: Seen, video: Footage, preview: Suggestion, wanted: dict[str, An
         places, moved = places[inside], moved[inside]
     held = None if wanted["hold"] is not None else held_end(places, moved, up)
     if held is not None:
-        shown["hold"] = held.name
+        shown["hold"], own, others = held
         told.append(
-            f"held: {held.name}, as the film shows; that end moves by {held.moves:.1f} pixels, the rest by "
-            f"{held.others:.0f}"
+            f"held: {shown['hold']}, as the film shows; that end moves by {own:.1f} pixels, the rest by {others:.0f}"
         )
     return shown, told
 
@@ -263,13 +262,9 @@ def upright_in(camera: Camera, guess: Sequence[float]) -> list[float] | None:
 
 
 def longest_side(name: str, metres: float, seen: Seen, preview: Suggestion) -> float:
-    """The length of the longest side [m] with which a named length has so many metres.
+    """The longest side [m] with which ``object``, a part, or two places X,Y:X,Y in the first frame have that length.
 
-    Args:
-        name: ``object``, a part, or two places in the film's first frame [pixels], as X,Y:X,Y.
-        metres: The length.
-        seen: The first frame.
-        preview: Of the splat with a longest side of 1 m.
+    The preview is that of the splat with a longest side of 1 m.
     """
     if not 0 < metres < math.inf:
         raise ValueError(f"Expected `--length` to have a length above 0 m, but got {metres}.")

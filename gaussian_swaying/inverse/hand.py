@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.inverse.registration import LEAST, SOLID, Registration, grey_of, refine
-from gaussian_swaying.inverse.tracks import STILL, follow, opencv
+from gaussian_swaying.inverse.tracks import STILL, corners, follow, opencv
 from gaussian_swaying.inverse.videos import Footage
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.protocol import RenderOutput
@@ -45,12 +45,7 @@ FEWEST_SQUARES = 50
 class Background:
     """Draws a scene at rest, and says which pixels show what stands still.
 
-    Args:
-        simulation: The scene. What it moves is no background.
-        also_moves: Names of parts of its splat that move in the film, too, though the simulation does not move them.
-
-    Raises:
-        ValueError: If there is no such part.
+    That is what is not simulated, without the parts of the splat that are named in ``also_moves``.
     """
 
     def __init__(self, simulation: Simulation, also_moves: Sequence[str] = ()) -> None:
@@ -89,44 +84,27 @@ def _widened(moving: Tensor) -> Tensor:
     return torch.from_numpy(cv2.distanceTransform((~moving).byte().numpy(), cv2.DIST_L2, 5)) <= REACH * side
 
 
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """The cameras of a film.
-
-    Attributes:
-        cameras: The camera of each frame.
-        unseen: Frames that show too little of the background; their cameras lie between those of their neighbours.
-        residual: Median over the frames of the root mean square distance of the points that agree [pixels].
-    """
-
-    cameras: tuple[Camera, ...]
-    unseen: tuple[int, ...]
-    residual: float
-
-
 def moves_by(video: Footage, background: Background) -> float:
-    """Distance that the background goes in the film of a camera that is said to stand still [pixels].
+    """Distance that the background goes in the film of a camera that is said to stand still [pixels]; 0 if unknown.
 
     It is the median over points and the largest of :data:`LOOKS` frames. Of each point only the motion across its edge
-    counts, as nothing holds it along a plain pole. 0 if the background has too few points.
+    counts, as nothing holds it along a plain pole.
     """
     import numpy as np
 
     cv2 = opencv()
     _, still = background.draw(video.cameras[0])
     first = grey_of(video.images[0])
-    corners = cv2.goodFeaturesToTrack(first, 300, 0.01, 7, mask=still.byte().numpy())
-    if corners is None or len(corners) < LEAST:
+    start, most = corners(first, 300, 0.01, 7, still.byte().numpy()), 0.0
+    if len(start) < LEAST:
         return 0.0
-    start, most = corners.reshape(-1, 2) + 0.5, 0.0
-    column, row = corners.reshape(-1, 2).round().astype(int).T
+    column, row = (start - 0.5).round().astype(int).T
     across = cv2.cornerEigenValsAndVecs(first, 7, 3)[row, column, 2:4]
     last = len(video.times) - 1
     for k in sorted({round(last * (n + 1) / LOOKS) for n in range(LOOKS)}):
-        pair = np.stack([first, grey_of(video.images[k])])[..., None].repeat(3, -1)
-        position, seen = follow(pair, start)
-        if seen[1].sum() >= LEAST:
-            most = max(most, float(np.median(abs(((position[1] - start) * across)[seen[1]].sum(-1)))))
+        (_, position), (_, seen) = follow(np.stack([first, grey_of(video.images[k])]), start)
+        if seen.sum() >= LEAST:
+            most = max(most, float(np.median(abs(((position - start) * across)[seen].sum(-1)))))
     return most
 
 
@@ -137,13 +115,12 @@ def stands_still(video: Footage) -> bool:
 
 
 def follow_camera(
-    video: Footage, background: Background, tick: Callable[[int], object] = lambda frames: None
-) -> Motion:
-    """Find the camera of each frame.
+    video: Footage, background: Background, tick: Callable[[int], object] = int
+) -> tuple[Footage, tuple[int, ...], float]:
+    """The video with the camera of each frame; its own may be that of the first frame, or rough ones of all.
 
-    Args:
-        video: The film. Its cameras may be those of the first frame, or rough ones of all frames.
-        tick: Called with 1 after each frame.
+    Frames that show too little of the background are listed, and have a camera between those of their neighbours. The
+    number is the median over the frames of the root mean square distance of the points that agree [pixels].
     """
     found: list[Registration | None] = []
     last: Camera | None = None
@@ -168,7 +145,7 @@ def follow_camera(
             "in the splat."
         )
     residual = torch.tensor([one.residual for one in found if one is not None]).median()
-    return Motion(_filled(video, found), unseen, float(residual))
+    return replace(video, cameras=_filled(video, found)), unseen, float(residual)
 
 
 def _filled(video: Footage, found: Sequence[Registration | None]) -> tuple[Camera, ...]:
@@ -194,14 +171,9 @@ def _carried(given: Camera, before: Camera, found: Camera) -> Camera:
 
 
 def gains(video: Footage, background: Background) -> tuple[Tensor, tuple[int, ...]] | None:
-    """Brightness of each frame over that of the splat, by colour.
+    """Brightness of each frame over that of the splat in red, green and blue, float64, shape (F, 3).
 
-    Args:
-        video: The film, with the camera of each frame.
-
-    Returns:
-        Gains of red, green and blue, float64, shape (F, 3), and the frames that show too little of the background,
-        which have those of their neighbours. None if all do.
+    Frames that show too little of the background have those of their neighbours, and are listed; None if all do.
     """
     import numpy as np
 
@@ -245,7 +217,7 @@ def _averaged(picture: Tensor) -> Tensor:
     return torch.nn.functional.avg_pool2d(picture.permute(2, 0, 1)[None], BLOCK)[0].flatten(1).T
 
 
-@dataclass(frozen=True)
+@dataclass
 class Judged:
     """The judgement of the background on the film of a camera.
 
@@ -264,7 +236,7 @@ class Judged:
     hand_held: bool = False
     residual: float = 0.0
     unseen: int = 0
-    gains: tuple[tuple[float, ...], ...] = ()
+    gains: Sequence[Sequence[float]] = ()
 
     def sentences(self) -> list[str]:
         found = []
@@ -295,7 +267,7 @@ def prepared(
     hand_held: bool | None = None,
     also_moves: Sequence[str] = (),
     say: Callable[[str], None] = lambda line: None,
-    tick: Callable[[int], object] = lambda frames: None,
+    tick: Callable[[int], object] = int,
 ) -> tuple[list[Footage], list[Judged]]:
     """Find the camera of each frame of films from a hand, and take drifts of exposure and white balance off all films.
 
@@ -303,8 +275,7 @@ def prepared(
         hand_held: Whether their cameras move otherwise than they are said to. None: those whose frames all have one
             camera, but whose background moves by more than half a pixel.
         also_moves: Names of parts of the splat that move in the films, though the simulation does not move them.
-        say: Called with a line for each thing that is done.
-        tick: Called with the number of frames whose camera was found.
+        say: Called with a line for each thing that is done; ``tick`` with the number of frames whose camera was found.
 
     Returns:
         The films, and what the background says of each; nothing if the splat has none.
@@ -321,14 +292,13 @@ def prepared(
     for video in videos:
         one = Judged(video.name, len(video.times))
         if hand_held is not False and stands_still(video):
-            one = replace(one, moved=moves_by(video, background))
+            one.moved = moves_by(video, background)
         if hand_held or (one.moved > STILL and hand_held is None):
-            motion = follow_camera(video, background, tick)
-            video = replace(video, cameras=motion.cameras)
-            one = replace(one, hand_held=True, residual=motion.residual, unseen=len(motion.unseen))
+            video, unseen, one.residual = follow_camera(video, background, tick)
+            one.hand_held, one.unseen = True, len(unseen)
         if (bright := gains(video, background)) is not None:
             video = replace(video, images=with_gains(video.images, bright[0]))
-            one = replace(one, gains=tuple(tuple(end.tolist()) for end in (bright[0].amin(0), bright[0].amax(0))))
+            one.gains = bright[0].amin(0).tolist(), bright[0].amax(0).tolist()
         for line in one.sentences():
             say(line)
         found.append(video)

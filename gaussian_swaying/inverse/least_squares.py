@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -23,8 +23,8 @@ CLOSELY, ROUGHLY = (3e-4, 1e-4), (9e-3, 3e-3)
 """Shortest step, as a share of the ranges, and least gain, as a share of the cost, that are worth another one: of the
 last stage, and of the others."""
 
-RESCALED, ALIKE = 4, 1.1
-"""Most times that the standard deviations of the residuals are estimated, and ratio below which they stay."""
+ALIKE = 1.1
+"""Ratio of standard deviations of the residuals below which they stay."""
 
 LEAST = 0.05
 """Least standard deviation of the residuals [pixels]."""
@@ -94,63 +94,56 @@ def scale_of(block: Block, least: float = LEAST) -> float:
 def solve(
     residuals: Residuals, place: Tensor, most: int, closely: bool = False, scale: Callable[[Block], float] = scale_of
 ) -> Solved:
-    """Minimise the cost from a place by SciPy's dogleg within the ranges.
+    """Minimise the cost from a place by SciPy's dogleg within the ranges; ``closely`` if small steps count.
 
-    The standard deviation of the residuals is estimated anew where it ends, until it stays.
-
-    Args:
-        most: Most steps that are tried.
-        closely: Whether small steps count.
-        scale: Standard deviation of the first variant's residuals.
+    At most so many steps are tried. The standard deviation of the residuals is that of the place, and is estimated anew
+    where it ends, until it stays.
     """
     from scipy.optimize import least_squares
 
     xtol, ftol = CLOSELY if closely else ROUGHLY
-    begin, tried, ended = place.double(), 0, ""
-    block = residuals(begin[None])
-    for _ in range(RESCALED):
-        sigma, known = scale(block), {begin.numpy().tobytes(): block}
-        used = block.values[0].flatten().isfinite()
-        if not bool(used.any()):
-            raise DivergedError(DIVERGED)
+    begin = place.double()
+    known = {begin.numpy().tobytes(): residuals(begin[None])}
+    first = known[begin.numpy().tobytes()]
+    sigma, used = scale(first), first.values[0].flatten().isfinite()
+    if not bool(used.any()):
+        raise DivergedError(DIVERGED)
 
-        def at(shift: Any, begin: Tensor, sigma: float, used: Tensor, known: dict[bytes, Block]) -> Any:
-            there = begin + torch.from_numpy(shift)
-            key = there.numpy().tobytes()
-            known[key] = known.get(key) or residuals(there[None])
-            return (known[key].values[0].flatten()[used].double() / sigma).numpy()
+    def at(shift: Any) -> Any:
+        there = begin + torch.from_numpy(shift)
+        key = there.numpy().tobytes()
+        known[key] = known.get(key) or residuals(there[None])
+        return (known[key].values[0].flatten()[used].double() / sigma).numpy()
 
-        def slopes(shift: Any, begin: Tensor, sigma: float, used: Tensor, known: dict[bytes, Block]) -> Any:
-            both, widths = _beside(begin + torch.from_numpy(shift))
-            high, low = (residuals(both).values.flatten(1)[:, used].double() / sigma).chunk(2)
-            return torch.nan_to_num((high - low) / widths[:, None], posinf=0.0, neginf=0.0).T.numpy()
+    def slopes(shift: Any) -> Any:
+        both, widths = _beside(begin + torch.from_numpy(shift))
+        high, low = (residuals(both).values.flatten(1)[:, used].double() / sigma).chunk(2)
+        return torch.nan_to_num((high - low) / widths[:, None], posinf=0.0, neginf=0.0).T.numpy()
 
-        found = least_squares(  # of shifts from the place, as its first step is then no longer than `x_scale`
-            at,
-            0 * begin.numpy(),
-            slopes,
-            bounds=((-begin).numpy(), (1 - begin).numpy()),
-            method="dogbox",
-            x_scale=REACH,
-            loss="huber",
-            f_scale=HUBER,
-            xtol=xtol,
-            ftol=ftol,
-            gtol=None,
-            max_nfev=1 + most - tried,
-            args=(begin, sigma, used, known),
-        )
-        tried += found.nfev - 1
-        end = (begin + torch.from_numpy(found.x)).clamp(0.0, 1.0)
-        moved, begin = float((end - begin).abs().amax()), end
-        block = known.get(end.numpy().tobytes()) or residuals(end[None])
-        ended = {0: "", 2: f"the last step lowered the cost by less than {ftol:.2%}"}.get(
-            found.status, f"the last step was below {xtol:g} of every range"
-        )
-        now = scale(block)
-        if moved < xtol or max(now / sigma, sigma / now) < ALIKE or tried >= most:
-            break
-    return Solved(begin, block, now, NO_STEP if ended and moved == 0 else ended, tried)
+    found = least_squares(  # of shifts from the place, as its first step is then no longer than `x_scale`
+        at,
+        0 * begin.numpy(),
+        slopes,
+        bounds=((-begin).numpy(), (1 - begin).numpy()),
+        method="dogbox",
+        x_scale=REACH,
+        loss="huber",
+        f_scale=HUBER,
+        xtol=xtol,
+        ftol=ftol,
+        gtol=None,
+        max_nfev=1 + most,
+    )
+    end = (begin + torch.from_numpy(found.x)).clamp(0.0, 1.0)
+    block = known.get(end.numpy().tobytes()) or residuals(end[None])
+    ended = {0: "", 2: f"the last step lowered the cost by less than {ftol:.2%}"}.get(
+        found.status, f"the last step was below {xtol:g} of every range"
+    )
+    now, tried = scale(block), found.nfev - 1
+    if float((end - begin).abs().amax()) >= xtol and max(now / sigma, sigma / now) >= ALIKE and tried < most:
+        again = solve(residuals, end, most - tried, closely, scale)
+        return replace(again, steps=tried + again.steps)
+    return Solved(end, block, now, NO_STEP if ended and torch.equal(end, begin) else ended, tried)
 
 
 def _beside(place: Tensor) -> tuple[Tensor, Tensor]:
@@ -168,19 +161,15 @@ class Normal:
     """Normal equations: sums over the residuals and their sensitivities at a point.
 
     Attributes:
-        cost: Mean of Huber's function over all residuals, each in standard deviations.
         gradient: Weighed sum of sensitivity times residual, shape (U,).
         matrix: Weighed sum of sensitivity times sensitivity, J^T W J, shape (U, U).
         scores: The gradient of each cluster of correlated residuals, shape (C, U): patches of the object at all times,
             and parts of the time all over the object.
-        count: Number of residuals.
     """
 
-    cost: float
     gradient: Tensor
     matrix: Tensor
     scores: tuple[Tensor, Tensor]
-    count: int
 
     def covariance(self) -> Tensor:
         r"""Covariance of the unknowns in shares of their ranges, shape (U, U).
@@ -214,23 +203,10 @@ def linearised(residuals: Residuals, place: Tensor, scale: Callable[[Block], flo
     flat = (change * weight.sqrt()).flatten(1)
     moment = torch.zeros_like(block.cluster) if block.moment is None else block.moment
     scores = [own.new_zeros(1 + int(one.max()), unknowns).index_add(0, one, own) for one in (block.cluster, moment)]
-    cost = float(cost_of(block, sigma)[0])
-    return Normal(cost, own.sum(0), flat @ flat.mT, (scores[0], scores[1]), int(usable.sum()))
+    return Normal(own.sum(0), flat @ flat.mT, (scores[0], scores[1]))
 
 
 def step_from(normal: Normal, place: Tensor) -> Tensor:
     """Return the end of a Gauss-Newton step within the ranges, of :data:`REACH` at most."""
-    from scipy.optimize import lsq_linear
-
-    values, vectors = torch.linalg.eigh(normal.matrix)
-    root = values.clamp(min=1e-12 * max(float(values[-1]), 1e-300)).sqrt()
-    low, high = (-place).clamp(min=-REACH), (1 - place).clamp(max=REACH)
-    wanted = -(vectors.mT @ normal.gradient) / root
-    found = lsq_linear((root[:, None] * vectors.mT).numpy(), wanted.numpy(), bounds=(low.numpy(), high.numpy()))
-    return (place + torch.from_numpy(found.x)).clamp(0.0, 1.0)
-
-
-def expected_gain(normal: Normal, step: Tensor) -> float:
-    """Expected relative decrease of the cost for a step, with linearised residuals."""
-    fall = -(normal.gradient @ step + 0.5 * step @ normal.matrix @ step) / max(normal.count, 1)
-    return float(fall) / max(normal.cost, 1e-300)
+    step = -torch.linalg.pinv(normal.matrix, hermitian=True) @ normal.gradient
+    return (place + step.clamp(-REACH, REACH)).clamp(0.0, 1.0)

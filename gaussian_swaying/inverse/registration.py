@@ -17,7 +17,7 @@ from gaussian_swaying.gaussians.measures import Gaussians
 from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.geometry.origin import Origin
 from gaussian_swaying.geometry.rotations import rotation_of
-from gaussian_swaying.inverse.tracks import follow, opencv
+from gaussian_swaying.inverse.tracks import corners, follow, opencv
 from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
 from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.suggestion.up import guess_up
@@ -82,15 +82,9 @@ def painter_of(cloud: GaussianCloud) -> Draw:
 def register(
     frame: Tensor, cloud: GaussianCloud, up: Sequence[float] | None = None, fov: float | None = None
 ) -> tuple[Registration, RenderOutput]:
-    """Find the camera of a frame of a splat at rest, and the picture of the splat from there.
+    """Find the camera of a frame, uint8 (H, W, 3), of a splat at rest, and the picture of the splat from there.
 
-    Args:
-        frame: The frame, dtype uint8, shape (H, W, 3), without lens distortion.
-        up: Direction in the splat that is up, shape (3,); guessed if it is None.
-        fov: Vertical field of view [degrees]; found if it is None.
-
-    Raises:
-        ValueError: If the splat is not found in the frame.
+    What is up in the splat (3,), and the vertical field of view [degrees], are guessed and found if they are None.
     """
     splat, draw, generator = Gaussians.of(cloud), painter_of(cloud), torch.Generator().manual_seed(0)
     height, width = frame.shape[:2]
@@ -113,17 +107,9 @@ def cameras_around(
     count: int = 12,
     elevations: Sequence[float] = (0.0, 30.0),
 ) -> list[Camera]:
-    """Cameras around an object from which a registration may start.
+    """Cameras around an object at a distance [scene units] from which a registration may start.
 
-    Args:
-        center: Of the object [scene units], shape (3,).
-        distance: From there [scene units].
-        up: Direction that is up, shape (3,).
-        fov_y_degrees: Vertical field of view [degrees].
-        width: Of the frame [pixels].
-        height: Of the frame [pixels].
-        count: Directions around the object.
-        elevations: Angles above the level [degrees].
+    They look from so many directions at each elevation [degrees] above the level.
     """
     middle = torch.as_tensor(center, dtype=torch.float64)
     axis = torch.nn.functional.normalize(torch.as_tensor(up, dtype=torch.float64), dim=0)
@@ -156,17 +142,15 @@ def transforms(camera: Camera, film: str, origin: Origin) -> dict[str, Any]:
 
 
 def find_camera(draw: Draw, frame: Tensor, start: Sequence[Camera], *, focal: bool = False) -> Registration:
-    """Find the camera of a frame of something that stands still.
+    """Find the camera of a frame, uint8 (H, W, 3), of something at rest, without lens distortion.
 
     Args:
         draw: Draws the splat, at rest.
-        frame: The frame, dtype uint8, shape (H, W, 3), without lens distortion.
         start: Cameras to begin with, of the frame's size and with its intrinsics; the one with the most matches that
             agree is taken. One is enough if it is within some 20 degrees.
         focal: Whether the focal length is to be found, too. It needs depth in what is seen, or a slanted surface.
 
     Raises:
-        ImportError: Without OpenCV.
         ValueError: If the frame and the cameras do not fit, or the splat is not found in the frame.
     """
     cv2 = opencv()
@@ -176,7 +160,7 @@ def find_camera(draw: Draw, frame: Tensor, start: Sequence[Camera], *, focal: bo
     grey = grey_of(frame)
     sift = cv2.SIFT_create(nfeatures=4000, contrastThreshold=0.02)
     wanted = sift.detectAndCompute(grey, None)
-    tried = [_by_features(cv2, sift, wanted, draw(camera), camera, focal=False) for camera in start]
+    tried = [_by_features(sift, wanted, draw(camera), camera) for camera in start]
     best = max((one for one in tried if one is not None), key=lambda one: one.agreeing, default=None)
     if best is None:
         raise ValueError(
@@ -184,23 +168,16 @@ def find_camera(draw: Draw, frame: Tensor, start: Sequence[Camera], *, focal: bo
             "with more texture."
         )
     for _ in range(ROUNDS):
-        best = _by_features(cv2, sift, wanted, draw(best.camera), best.camera, focal) or best
+        best = _by_features(sift, wanted, draw(best.camera), best.camera, focal) or best
     for _ in range(ROUNDS if best.agreeing < ENOUGH else 0):
         best = _by_flow(grey, draw(best.camera), best.camera, focal) or best
     return best
 
 
 def refine(frame: Tensor, picture: RenderOutput, camera: Camera, where: Tensor) -> Registration | None:
-    """The camera of a frame, from points that are followed there from a picture taken nearby.
+    """The camera of a frame from a picture from nearby, of whose pixels ``where`` (H, W) count; None if too few agree.
 
-    Args:
-        frame: The frame, dtype uint8, shape (H, W, 3).
-        picture: The splat, drawn from ``camera``.
-        camera: A camera so near that most points move by less than some 20 pixels.
-        where: The pixels of the picture that count, bool, shape (H, W).
-
-    Returns:
-        None if too few points agree.
+    Most points may have moved by some 20 pixels.
     """
     return _by_flow(grey_of(frame), picture, camera, False, _near(camera), where)
 
@@ -234,34 +211,34 @@ def in_space(picture: RenderOutput, camera: Camera, pixel: Any) -> tuple[Any, An
 
 
 def off_camera(world: Any, there: Any, intrinsics: Any, near: float) -> Any:
-    """Distances of points in a frame from where the camera sees them that agrees with most of them [pixels].
+    """Distances of points (T, 3) from where the camera sees them that agrees with most of their places (T, 2) [pixels].
 
-    Args:
-        world: Their places in space, shape (T, 3).
-        there: Where they are in the frame [pixels], shape (T, 2).
-        intrinsics: Of the camera, shape (3, 3).
-        near: Largest distance of points that agree [pixels].
-
-    Returns:
-        Shape (T,); None if less than half of them agree on a camera.
+    Points agree that are nearer than ``near`` [pixels]. Shape (T,); None if less than half of them agree on a camera.
     """
+    found = _pose(world, there, intrinsics, near) if len(world) >= 8 else None
+    return None if found is None or 2 * int(found[0].sum()) < len(world) else found[3]
+
+
+def _pose(world: Any, there: Any, K: Any, near: float) -> tuple[Any, Any, Any, Any] | None:
+    """Which points (T, 3) agree on a pose, its rotation vector and shift, and how far all are off [pixels]."""
     import numpy as np
 
-    cv2 = opencv()
-    if len(world) < 8:
+    cv2, how = opencv(), {"iterationsCount": 2000, "confidence": 0.9999, "flags": opencv().SOLVEPNP_AP3P}
+    done, turn, shift, agree = cv2.solvePnPRansac(world, there, K, None, reprojectionError=near, **how)
+    if not done:
         return None
-    done, turn, shift, agree = cv2.solvePnPRansac(
-        world, there, intrinsics, None, reprojectionError=near, flags=cv2.SOLVEPNP_AP3P
-    )
-    if not done or len(agree) < 0.5 * len(world):
-        return None
-    agree = agree[:, 0]
-    turn, shift = cv2.solvePnPRefineLM(world[agree], there[agree], intrinsics, None, turn, shift)
-    return np.linalg.norm(cv2.projectPoints(world, turn, shift, intrinsics, None)[0].reshape(-1, 2) - there, axis=-1)
+    agree = np.isin(np.arange(len(world)), agree)
+    for _ in range(REFINED):
+        turn, shift = cv2.solvePnPRefineLM(world[agree], there[agree], K, None, turn, shift)
+        off = np.linalg.norm(cv2.projectPoints(world, turn, shift, K, None)[0].reshape(-1, 2) - there, axis=-1)
+        agree = off < near
+        if agree.sum() < 4:
+            return None
+    return agree, turn, shift, off
 
 
 def _by_features(
-    cv2: Any, sift: Any, wanted: tuple[Any, Any], picture: RenderOutput, camera: Camera, focal: bool
+    sift: Any, wanted: tuple[Any, Any], picture: RenderOutput, camera: Camera, focal: bool = False
 ) -> Registration | None:
     """The camera from matched features; None if too few agree."""
     import numpy as np
@@ -270,13 +247,13 @@ def _by_features(
     points, codes = sift.detectAndCompute(grey_of(picture.color), mask)
     if codes is None or wanted[1] is None or len(points) < LEAST or len(wanted[0]) < LEAST:
         return None
-    pairs = cv2.BFMatcher().knnMatch(codes, wanted[1], k=2)
+    pairs = opencv().BFMatcher().knnMatch(codes, wanted[1], k=2)
     good = [pair[0] for pair in pairs if len(pair) == 2 and pair[0].distance < RATIO * pair[1].distance]
     if len(good) < LEAST:
         return None
     here = np.array([points[one.queryIdx].pt for one in good]) + 0.5  # OpenCV counts from the centre of a pixel
     there = np.array([wanted[0][one.trainIdx].pt for one in good]) + 0.5
-    return _seen_from(cv2, picture, camera, here, there, focal, _near(camera))
+    return _seen_from(picture, camera, here, there, focal, _near(camera))
 
 
 def _by_flow(
@@ -294,57 +271,35 @@ def _by_flow(
     solid = picture.alpha[..., 0].detach().cpu().numpy() > SOLID
     solid = solid if where is None else solid & where.numpy()
     mask = cv2.erode(solid.astype(np.uint8), np.ones((5, 5), np.uint8))
-    corners = cv2.goodFeaturesToTrack(drawn, 1000, 0.005, 3, mask=mask)
-    if corners is None or len(corners) < LEAST:
+    here = corners(drawn, 1000, 0.005, 3, mask)
+    if len(here) < LEAST:
         return None
-    here = corners.reshape(-1, 2).astype(np.float64) + 0.5
-    (_, place), (_, seen) = follow(np.stack([drawn, grey])[..., None].repeat(3, -1), here)
-    return _seen_from(cv2, picture, camera, here[seen], place[seen], focal, near)
+    (_, place), (_, seen) = follow(np.stack([drawn, grey]), here)
+    return _seen_from(picture, camera, here[seen], place[seen], focal, near)
 
 
 def _seen_from(
-    cv2: Any, picture: RenderOutput, camera: Camera, here: Any, there: Any, focal: bool, near: float
+    picture: RenderOutput, camera: Camera, here: Any, there: Any, focal: bool, near: float
 ) -> Registration | None:
     """The camera that sees what the picture shows at ``here`` at ``there``; None if too few pairs agree."""
     import numpy as np
 
+    cv2, K = opencv(), camera.intrinsics.double().cpu().numpy()
     world, known = in_space(picture, camera, here)
     world, there = world[known], np.ascontiguousarray(there[known], dtype=np.float64)
-    if len(world) < LEAST:
+    pose = _pose(world, there, K, near) if len(world) >= LEAST else None
+    if pose is None or pose[0].sum() < LEAST:
         return None
-    K = camera.intrinsics.double().cpu().numpy().copy()
-    done, turn, shift, _ = cv2.solvePnPRansac(
-        world, there, K, None, iterationsCount=2000, reprojectionError=near, confidence=0.9999, flags=cv2.SOLVEPNP_AP3P
-    )
-    view = camera.world_to_camera.double().cpu().numpy()
-    begun = cv2.solvePnPRefineLM(world, there, K, None, cv2.Rodrigues(view[:3, :3])[0], view[:3, 3:].copy())
-    found = [_agreeing(cv2, world, there, K, near, *pair) for pair in [begun] + [(turn, shift)] * done]
-    index, turn, shift = max(found, key=lambda one: len(one[0]))
-    if len(index) < LEAST:
-        return None
-    world, there = world[index], there[index]
+    agree, turn, shift, _ = pose
+    world, there = world[agree], there[agree]
     if focal:
         flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO
         flags |= cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
         size = (camera.width, camera.height)
-        given = ([world.astype(np.float32)], [there.astype(np.float32)], size, K, None)
+        given = ([world.astype(np.float32)], [there.astype(np.float32)], size, K.copy(), None)
         _, K, _, (turn,), (shift,) = cv2.calibrateCamera(*given, flags=flags)
     off = cv2.projectPoints(world, turn, shift, K, None)[0].reshape(-1, 2) - there
     view = np.eye(4)
     view[:3, :3], view[:3, 3] = cv2.Rodrigues(turn)[0], shift.reshape(3)
     seen = replace(camera, world_to_camera=torch.from_numpy(view), intrinsics=torch.from_numpy(np.asarray(K, float)))
-    residual = float(np.sqrt((off**2).sum(1).mean()))
-    return Registration(seen, int(known.sum()), len(index), residual)
-
-
-def _agreeing(cv2: Any, world: Any, there: Any, K: Any, near: float, turn: Any, shift: Any) -> tuple[Any, Any, Any]:
-    import numpy as np
-
-    index: Any = np.arange(0)
-    for _ in range(REFINED):
-        off = cv2.projectPoints(world, turn, shift, K, None)[0].reshape(-1, 2) - there
-        index = np.flatnonzero(np.linalg.norm(off, axis=1) < near)
-        if len(index) < LEAST:
-            break
-        turn, shift = cv2.solvePnPRefineLM(world[index], there[index], K, None, turn, shift)
-    return index, turn, shift
+    return Registration(seen, int(known.sum()), len(world), float(np.sqrt((off**2).sum(1).mean())))

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import base64
 import html
-import io
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 import torch
 from torch import Tensor
@@ -20,7 +19,7 @@ from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.inverse.hand import Judged
 from gaussian_swaying.inverse.pictures import BEFORE, titled
-from gaussian_swaying.inverse.unknowns import SCALE, Direction, Unknown, model_of, of_simulation, values_at
+from gaussian_swaying.inverse.unknowns import SCALE, Unknown, of_simulation, values_at
 from gaussian_swaying.inverse.videos import Footage
 from gaussian_swaying.recording.video import VideoEncoder
 from gaussian_swaying.simulation.model import POLAR, flow_of, in_settings
@@ -30,6 +29,7 @@ if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
 PICTURES = "pictures"
+PSNR = ("fitted", "predicted", "rest")
 
 ASTRAY = 6.0
 """Largest accepted PSNR loss of fitted frames against the frame at rest [dB]; 6 dB is four times the squared error."""
@@ -66,13 +66,12 @@ class Fit:
 
     Attributes:
         covariance: Covariance of the places, as shares of the ranges, shape (U, U).
-        directions: Principal directions of the sensitivities, the best known first.
         shown: Comparison with the video of each camera.
         unsettled: The reason why the values are not a local minimum, and a remedy; empty if they are one.
         notes: What the videos say against the plan.
         followed: For each camera, the share of the motion of its tracks in the fitted frames that the simulation
             explains: 1 - (sum of squared distances) / (sum of squared displacements), of tracks that were not fitted
-            and without half a pixel of noise. Without tracks it is empty.
+            and without half a pixel of noise; at least 0 for each track. Without tracks it is empty.
         assumed: What the values rest on that nobody measured, as sentences.
         seen: Where the wind blows, as each camera sees it, as sentences.
         judged: What the background says of the video of each camera; nothing without one.
@@ -82,7 +81,6 @@ class Fit:
     unknowns: Sequence[Unknown]
     place: tuple[float, ...]
     covariance: Tensor
-    directions: Sequence[Direction]
     shown: Sequence[Shown]
     history: Sequence[Mapping[str, Any]]
     seconds: float
@@ -135,7 +133,7 @@ class Fit:
         for name, share in self.followed.items():
             if share < FOLLOWED:
                 (failed if share < LOST else doubtful).append(
-                    f"camera {name}: the simulation explains {max(share, 0):.0%} of the motion of its tracks. {CHECK}, "
+                    f"camera {name}: the simulation explains {share:.0%} of the motion of its tracks. {CHECK}, "
                     "or film from a side where the motion is across the picture."
                 )
         for one in self.shown:
@@ -190,17 +188,18 @@ def predictions(
     moved: Iterable[DeformedGaussians],
     films: Path | None = None,
 ) -> list[Shown]:
-    """Compare moving Gaussians with whole videos.
+    """Compare all Gaussians at each time with whole videos, of which so many times were fitted.
 
-    Args:
-        simulation: Draws the Gaussians.
-        fitted: Number of them that were fitted.
-        moved: All Gaussians at each of the times.
-        films: Folder for ``film_CAMERA.mp4``: the video beside the fit.
+    ``film_CAMERA.mp4``, the video beside the fit, is written into the folder ``films``.
     """
     squares: list[tuple[list[float], list[float]]] = [([], []) for _ in videos]
-    painter = simulation.painter
-    with _films(films, videos) as add:
+    painter, encoders = simulation.painter, list[VideoEncoder]()
+    with ExitStack() as left:
+        for video in videos if films else ():
+            films.mkdir(exist_ok=True)  # type: ignore[union-attr]
+            rate = (len(video.times) - 1) / (video.times[-1] - video.times[0])
+            encoders.append(VideoEncoder(films / f"film_{video.name}.mp4", rate))  # type: ignore[operator]
+            left.callback(encoders[-1].abort)
         for k, (time, gaussians) in enumerate(zip(times, moved, strict=True)):
             for number, video in enumerate(videos):
                 if (frame := video.frame_at(time)) is None:
@@ -208,34 +207,15 @@ def predictions(
                 drawn = painter.picture(gaussians, video.cameras[frame].to(painter.device))
                 shown, real = drawn.color.clamp(0, 1).float().cpu(), video.images[frame].float() / 255
                 squares[number][k >= fitted].append(float((shown - real).square().mean()))
-                add(number, [(f"film, {time:.2f} s", real), ("predicted" if k >= fitted else "fitted", shown)])
+                if encoders:
+                    title = "predicted" if k >= fitted else "fitted"
+                    encoders[number].write(titled([(f"film, {time:.2f} s", real), (title, shown)]))
+        for encoder in encoders:
+            encoder.finish()
     return [
         Shown(video.name, _psnr(before), _psnr(after), _psnr(before[:1]))
         for video, (before, after) in zip(videos, squares, strict=True)
     ]
-
-
-@contextmanager
-def _films(folder: Path | None, videos: Sequence[Footage]) -> Iterator[Callable[[int, list[tuple[str, Tensor]]], None]]:
-    """Writes ``film_CAMERA.mp4`` for each camera; yields the function that adds a frame to that of a number."""
-    encoders = []
-    for video in videos if folder is not None else ():
-        assert folder is not None
-        folder.mkdir(exist_ok=True)
-        rate = (len(video.times) - 1) / (video.times[-1] - video.times[0])
-        encoders.append(VideoEncoder(folder / f"film_{video.name}.mp4", rate))
-
-    def add(number: int, panels: list[tuple[str, Tensor]]) -> None:
-        if encoders:
-            encoders[number].write(titled(panels))
-
-    try:
-        yield add
-        for encoder in encoders:
-            encoder.finish()
-    finally:
-        for encoder in encoders:
-            encoder.abort()
 
 
 def write_results(
@@ -244,67 +224,50 @@ def write_results(
     """Write ``values.csv``, ``result.json`` and ``scene.yaml``."""
     write_table(folder / "values.csv", result.rows())
     failed, doubtful = result.doubts()
-    write_json(
-        folder / "result.json",
-        {
-            "values": result.rows(),
-            "covariance_of_shares": result.covariance.tolist(),
-            "sensitivities": [{"strength": d.strength, "direction": d.sentence} for d in result.directions],
-            "cameras": [
-                {
-                    "camera": s.camera,
-                    "psnr_fitted_db": s.fitted,
-                    "psnr_predicted_db": s.predicted,
-                    "psnr_rest_db": s.rest,
-                }
-                for s in result.shown
-            ],
-            "verdict": result.verdict,
-            "why": [*failed, *doubtful],
-            "motion_explained": dict(result.followed),
-            "assumed": list(result.assumed),
-            "background": [asdict(one) for one in result.judged],
-            "not_settled": result.unsettled,
-            "not_followed": result.astray,
-            "not_determined": result.vague,
-            "history": list(result.history),
-            "seconds": result.seconds,
-        },
-    )
+    told = {
+        "values": result.rows(),
+        "covariance_of_shares": result.covariance.tolist(),
+        "cameras": [{"camera": one.camera} | {f"psnr_{n}_db": getattr(one, n) for n in PSNR} for one in result.shown],
+        "verdict": result.verdict,
+        "why": [*failed, *doubtful],
+        "motion_explained": result.followed,
+        "assumed": result.assumed,
+        "background": [asdict(one) for one in result.judged],
+        "not_settled": result.unsettled,
+        "not_followed": result.astray,
+        "not_determined": result.vague,
+        "history": result.history,
+        "seconds": result.seconds,
+    }
+    write_json(folder / "result.json", told)
     write_text(folder / "scene.yaml", scene_text(result.values, parser, settings, simulation))
 
 
 def scene_text(values: Mapping[str, float], parser: ArgumentParser, settings: Namespace, simulation: Simulation) -> str:
     """The configuration of the base with the values that were found, as YAML for ``sim``."""
-    found, remark = settings.clone(), ""
+    found = settings.clone()
     if any(name in values for name in POLAR):
         found.wind.flow = flow_of(simulation.wind.flows[0].tolist(), values)  # type: ignore[index]
     in_settings(found, {name: value for name, value in of_simulation(values).items() if name not in POLAR})
-    if SCALE in values:
+    if SCALE in values:  # cells and spacings are in metres
         ratio = values[SCALE] / simulation.scene.frame.metres_per_unit
-        remark = f"# Below, a metre is a length of {ratio:.6g} m.\n"
-        model = model_of(simulation.model, values)
-        scaled = ("material.E", "material.density", "solver.gravity")
-        in_settings(found, {name: model.value(name) for name in scaled})
-        for row in found.wind.schedule or ():
-            row["flow"] = [part / ratio for part in row["flow"]]
-        found.wind.flow = found.wind.flow and [part / ratio for part in found.wind.flow]
-        if found.material.bending is not None:
-            found.material.bending /= ratio**5
-    told = "".join(f"# {name}: {value:.6g}\n" for name, value in values.items()) + remark
+        found.scene.metres_per_unit, found.scene.longest_side = values[SCALE], None
+        found.solver.dx = ratio * float(simulation.solver.dx)
+        if found.scene.filling and found.scene.filling.spacing:
+            found.scene.filling.spacing *= ratio
+    told = "".join(f"# {name}: {value:.6g}\n" for name, value in values.items())
     return "# Found by gaussian-swaying fit:\n" + told + f"frames: {settings.frames}\n" + config_text(parser, found)
 
 
-def consequences(
-    assumed: Sequence[str], values: Mapping[str, float], simulation: Simulation, gravity: Sequence[float]
-) -> list[str]:
+def consequences(assumed: Sequence[str], values: Mapping[str, float], simulation: Simulation) -> list[str]:
     """Sentences on what follows for the values from what was only assumed, of ``length`` and ``mass``."""
     scene, found = simulation.scene, []
     longest = scene.size * scene.frame.metres_per_unit
     if "length" in assumed:
         speed = values.get("wind.speed")
         told = "" if speed is None else f" In its own lengths the speed is {speed / longest:.3g} a second."
-        told += " Gravity makes both depend on the length: measure one, and give it with --length." * any(gravity)
+        if any(simulation.model.value("solver.gravity")):
+            told += " Gravity makes both depend on the length: measure one, and give it with --length."
         found.append(
             f"No length is known: the longest side of what moves was taken as {longest:.3g} m. Metres a second and "
             f"pascals have no absolute value then, while angles do.{told}"
@@ -322,15 +285,12 @@ def wind_seen(values: Mapping[str, float], videos: Sequence[Footage], simulation
     """Sentences on where the wind blows in the picture of each camera; none if no direction was sought."""
     if not {"wind.azimuth", "wind.elevation"} & set(values):
         return []
-    start = simulation.wind.flows[0].tolist()  # type: ignore[index]
-    flow = torch.tensor(flow_of(start, values), dtype=torch.float64)
-    scene = flow @ simulation.scene.frame.rotation.double().cpu()
-    found = []
+    flow = torch.tensor(flow_of(simulation.wind.flows[0].tolist(), values)).double()  # type: ignore[index]
+    scene, found = flow @ simulation.scene.frame.rotation.double().cpu() / flow.norm(), []
     for video in videos:
-        turn = video.cameras[0].world_to_camera[:3, :3].double().cpu()
-        right, down, away = (turn @ scene / scene.norm()).tolist()
-        ways = [f"to the {'right' if right > 0 else 'left'}"] if abs(right) > 0.1 else []
-        ways += ["down" if down > 0 else "up"] if abs(down) > 0.2 else []
+        right, down, away = (video.cameras[0].world_to_camera[:3, :3].double().cpu() @ scene).tolist()
+        ways = [f"to the {'right' if right > 0 else 'left'}"] * (abs(right) > 0.1)
+        ways += ["down" if down > 0 else "up"] * (abs(down) > 0.2)
         angle = math.degrees(math.asin(min(1.0, abs(away))))
         ways.append(f"{angle:.0f} degrees {'away from' if away > 0 else 'towards'} it")
         found.append(f"camera {video.name} sees the wind blow {', '.join(ways)}")
@@ -353,36 +313,23 @@ td:first-child { text-align: left; } video, img { max-width: 100%; border: 1px s
 
 def write_page(folder: Path, result: Fit) -> None:
     """Write ``page.html``, named after the last two folders of its path, with the films and pictures of the fit."""
-    from PIL import Image
-
     name = html.escape("/".join(folder.resolve().parts[-2:]))
     failed, doubtful = result.doubts()
 
     def listed(sentences: Sequence[str]) -> str:
         return "<ul>" + "".join(f"<li>{html.escape(one)}</li>" for one in sentences) + "</ul>" if sentences else ""
 
-    def packed(data: bytes) -> str:
-        return base64.b64encode(data).decode("ascii")
-
     rows = "".join(
         f"<tr><td>{html.escape(row['name'])}</td><td>{row['value']:.5g}</td><td>± {row['standard_error']:.2g}</td>"
         f"<td>{html.escape(row['unit'])}</td><td>{row['low']:g} to {row['high']:g}</td></tr>"
         for row in result.rows()
     )
-    shown, below = "", ""
-    for one in result.shown:
-        film = packed((folder / PICTURES / f"film_{one.camera}.mp4").read_bytes())
-        shown += f'<video src="data:video/mp4;base64,{film}" autoplay loop muted controls></video>'
-        pictures = {
-            f"Before the fit: {title}, camera {one.camera}": folder / BEFORE / f"{name}_{one.camera}.png"
-            for name, title in (("rest", "the scene at rest"), ("tracks", "points that are followed"))
-        }
-        for title, path in pictures.items():
-            if path.exists():
-                data = io.BytesIO()
-                Image.open(path).convert("RGB").save(data, format="JPEG", quality=88)
-                told = html.escape(title)
-                below += f'<h3>{told}</h3><img src="data:image/jpeg;base64,{packed(data.getvalue())}" alt="{told}">'
+    shown = "".join(
+        f'<h3>Camera {html.escape(one.camera)}</h3><video src="{PICTURES}/film_{quote(one.camera)}.mp4" autoplay loop '
+        f'muted controls></video><img src="{BEFORE}/rest_{quote(one.camera)}.png" alt="the scene at rest">'
+        f'<img src="{BEFORE}/tracks_{quote(one.camera)}.png" alt="points that are followed">'
+        for one in result.shown
+    )
     text = f"""<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>{name}</title><style>{_STYLE}</style>
 <h1>{name}</h1>
@@ -390,11 +337,9 @@ def write_page(folder: Path, result: Fit) -> None:
 {listed([*failed, *doubtful])}
 <table><tr><th></th><th>value</th><th>standard error</th><th></th><th>range</th></tr>{rows}</table>
 {listed([*result.seen, *result.assumed])}
-<h2>The film beside the fit</h2>
+<h2>The film beside the fit, the scene at rest, and the points that are followed</h2>
 <p>At half speed. What is called predicted was not fitted.</p>
 {shown}
-<h2>Pictures</h2>
-{below}
 <script>for (const film of document.querySelectorAll('video')) film.playbackRate = 0.5;</script></html>
 """
     write_text(folder / "page.html", text)

@@ -24,25 +24,16 @@ from gaussian_swaying.simulation.simulation import Simulation
 WINDOW, WIDE = 15, 960
 """Side of the square that is followed, where the longer side of the picture has at most ``WIDE`` [pixels]."""
 
-
 LARGE = 2.0
 """Standard deviations of Gaussians that are left out, per the side of a window."""
 
 
 def drawn_beside(painter: Painter, gaussians: DeformedGaussians, camera: Camera, places: Tensor) -> Tensor:
-    """Return the offset between what is rendered and the projected centres of its Gaussians, averaged over windows.
+    """Rendered minus projected centres of Gaussians, averaged over windows at places (T, 2) [pixels], float64, (T, 2).
 
     A picture whose colours are the projected centres shows in each pixel the mean centre of the Gaussians that are seen
-    there, weighted by their share after alpha compositing. The offset of a pixel is its own place minus this.
-    Gaussians larger than windows, as those of a sky, are left out.
-
-    Args:
-        gaussians: All Gaussians of it, N.
-        camera: Its camera, on their device.
-        places: Centres of the windows [pixels], shape (T, 2).
-
-    Returns:
-        Rendered minus projected centre [pixels], float64, shape (T, 2).
+    there. The offset of a pixel is its own place minus this. Gaussians larger than windows, as those of a sky, are left
+    out.
     """
     side, middle = window_of(camera.width, camera.height), torch.tensor([0.5 * camera.width, 0.5 * camera.height])
     pixel, depth = project(gaussians.means, camera)
@@ -110,22 +101,17 @@ class Tracks:
 
 
 def track(simulation: Simulation, video: Footage, most: int = 400, first: DeformedGaussians | None = None) -> Tracks:
-    """Follow the Gaussians that a camera sees in its first frame.
+    """Follow the Gaussians that a camera sees in its first frame, those with the most texture.
 
     Args:
-        simulation: The scene, at rest where the video begins.
-        most: Largest number of tracks; those with the most texture are taken.
-        first: What the first frame shows, about, if it is not the scene at rest. The Gaussians are followed from a
-            picture of it to the first frame; those whose surroundings do not look alike there are not seen.
+        first: What that frame shows, about, if it is not the scene at rest. The Gaussians are followed from a picture
+            of it to the frame; those whose surroundings do not look alike there are not seen.
     """
-    if first is None:
-        chosen, start = _chosen(simulation, video, _grey(video.images[0]), most)
-        position, seen = map(torch.from_numpy, follow(video.images.numpy(), start.numpy()))
-        return Tracks(chosen, position, seen)
-    drawn = drawn_by(simulation, first, video.cameras[0])
-    chosen, start = _chosen(simulation, video, _grey(drawn), most, first)
-    images = torch.cat([drawn[None], video.images])
+    chosen, start, drawn = _chosen(simulation, video, most, first)
+    images = video.images if first is None else torch.cat([drawn[None], video.images])
     position, seen = map(torch.from_numpy, follow(images.numpy(), start.numpy()))
+    if first is None:
+        return Tracks(chosen, position, seen)
     seen &= alike(images[:2], position[:2]) > ALIKE
     return Tracks(chosen, position[1:], seen[1:])
 
@@ -166,11 +152,9 @@ def alike(images: Tensor, position: Tensor) -> Tensor:
 
 
 def still_until(simulation: Simulation, video: Footage, tracks: Tracks) -> float:
-    """Time of the last frame before what is followed begins to move [s]; 0 if it moves in the first frames.
+    """Time of the last frame before a quarter of the points begins to move [s]; 0 if it moves in the first frames.
 
     A point has moved if it is more than :data:`STILL` from where the camera of the frame would see it if it had stayed.
-    A quarter of the points has to.
-
     """
     scene = simulation.scene
     means = scene.model.means.detach()[scene.moving[tracks.index.to(scene.moving.device)]]
@@ -184,31 +168,23 @@ def still_until(simulation: Simulation, video: Footage, tracks: Tracks) -> float
 def match(
     simulation: Simulation, video: Footage, states: Sequence[State], most: int = 400, moving: bool = False
 ) -> Tracks:
-    """Find the Gaussians of a simulation in the video: match each rendered frame with the frame of the camera.
-
-    Nothing drifts, as every frame is matched anew, and a Gaussian that comes into sight again is found again. The
-    simulation must already be near, within a few tens of pixels.
+    """Find the Gaussians of a simulation, which must be within tens of pixels, anew in each frame of the video.
 
     Where Gaussians overlap, the picture shows mostly the nearest ones. So it shows a Gaussian beside its projected
     centre, by a part of a pixel that depends on the angle of view (:func:`drawn_beside`). A video of the real object
     does not have this offset; one that was rendered from the splat has it, too. The first frame, at rest, shows which
     is the case. The offset that remains there comes from a camera that is not quite right: its median is subtracted in
-    all frames, unless the video begins in motion.
-
-    Gaussians near the border are left out, as the border of a splat is not quite that of the real object.
+    all frames, unless the video begins in motion. Gaussians near the border are left out, as the border of a splat is
+    not quite that of the real object.
 
     Args:
-        states: The state at the time of each frame of the video; fewer if only the first frames are wanted.
+        states: The state at the time of each frame; fewer if only the first frames are wanted.
         moving: Whether the video begins in motion.
     """
     import numpy as np
 
     scene, painter, count = simulation.scene, simulation.painter, len(video.times)
-    if moving:
-        begun = painter.deformed(states[0])
-        chosen, _ = _chosen(simulation, video, _grey(drawn_by(simulation, begun, video.cameras[0])), most, begun)
-    else:
-        chosen, _ = _chosen(simulation, video, _grey(video.images[0]), most)
+    chosen, *_ = _chosen(simulation, video, most, painter.deformed(states[0]) if moving else None)
     index = scene.moving[chosen.to(scene.moving.device)]
     position = torch.zeros(count, len(chosen), 2, dtype=torch.float64)
     seen = torch.zeros(count, len(chosen), dtype=torch.bool)
@@ -235,23 +211,15 @@ def match(
 
 
 def _at_rest(off: Tensor, beside: Tensor) -> tuple[float, Tensor]:
-    """Return the share of the splat's offsets (T, 2) that a video at rest lacks, 0 to 1, and the median of the rest.
-
-    ``off`` are those of the matched positions in the video from the projected centres [pixels], shape (T, 2).
-    """
+    """Return the share of the splat's offsets (T, 2) that a video at rest lacks, 0 to 1, and the median of the rest."""
     share = float((-(off * beside).sum() / beside.square().sum().clamp(min=1e-12)).clamp(0.0, 1.0))
     return share, (off + share * beside).median(0).values
 
 
 def follow(images: Any, start: Any) -> tuple[Any, Any]:
-    """Follow points through a video.
+    """Follow points (T, 2) [pixels; the first pixel's centre is at 0.5] through uint8 frames (F, H, W, ...).
 
-    Args:
-        images: Frames as NumPy array, dtype uint8, shape (F, H, W, 3).
-        start: Points in the first frame [pixels; the first pixel's centre is at 0.5], shape (T, 2).
-
-    Returns:
-        NumPy arrays: positions, float64, shape (F, T, 2), and whether each is still valid, shape (F, T).
+    NumPy arrays: positions, float64, shape (F, T, 2), and whether each is still valid, shape (F, T).
     """
     import numpy as np
 
@@ -277,13 +245,25 @@ def follow(images: Any, start: Any) -> tuple[Any, Any]:
     return position, seen
 
 
+def corners(grey: Any, most: int, quality: float, apart: float, mask: Any) -> Any:
+    """Places with texture within a mask [pixels], at most so many and so far apart, NumPy array, shape (T, 2)."""
+    import numpy as np
+
+    found = opencv().goodFeaturesToTrack(grey, most, quality, apart, mask=mask)
+    return np.zeros((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64) + 0.5
+
+
 def _chosen(
-    simulation: Simulation, video: Footage, grey: Any, most: int, first: DeformedGaussians | None = None
-) -> tuple[Tensor, Tensor]:
-    """Return Gaussians that are visible at first and have texture around them, a few pixels apart; and their pixels."""
+    simulation: Simulation, video: Footage, most: int, first: DeformedGaussians | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return Gaussians that are visible at first and have texture around them, a few pixels apart, and their pixels.
+
+    The picture that shows the texture is the first frame, or that of other Gaussians; it is returned, too.
+    """
     import numpy as np
 
     scene, painter, camera = simulation.scene, simulation.painter, video.cameras[0]
+    image = video.images[0] if first is None else drawn_by(simulation, first, camera)
     with torch.no_grad():
         first, own = first or scene.rest(), camera.to(painter.device)
         pixel, depth = project(first.means[scene.moving], camera)
@@ -292,7 +272,7 @@ def _chosen(
     place = (_in_sight(pixel, depth, picture, BEHIND * scene.size) & opaque).nonzero()[:, 0]
     column, row = pixel[place].long().unbind(-1)
     width, height = video.size
-    texture = torch.from_numpy(np.asarray(opencv().cornerMinEigenVal(grey, 7)))
+    texture = torch.from_numpy(np.asarray(opencv().cornerMinEigenVal(_grey(image), 7)))
     score = texture[row, column]
     sharpest = texture.max() if scene.all_move else score.amax() if len(score) else 0.0  # not that of a background
     good = score > QUALITY * sharpest
@@ -306,7 +286,7 @@ def _chosen(
             taken[r + 2 : r + 7, c + 2 : c + 7] = True
             kept.append(int(place[k]))
     chosen = torch.tensor(sorted(kept), dtype=torch.long)
-    return chosen, pixel[chosen]
+    return chosen, pixel[chosen], image
 
 
 def _in_sight(pixel: Tensor, depth: Tensor, picture: RenderOutput, behind: float) -> Tensor:

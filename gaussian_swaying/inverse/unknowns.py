@@ -160,54 +160,38 @@ LARGE = 0.25
 """Share of the largest part of a direction below which an unknown is not named."""
 
 
-@dataclass(frozen=True)
-class Direction:
-    """A combination of the unknowns.
-
-    Attributes:
-        strength: Singular value: change of the residuals, in standard deviations, when the unknowns move along the
-            direction by the whole of their ranges.
-        parts: Share of each unknown, of length one.
-        sentence: The direction in words.
-    """
-
-    strength: float
-    parts: tuple[float, ...]
-    sentence: str
+Direction = tuple[float, list[float], str]
+"""A combination of the unknowns: how many standard deviations the residuals change along it by the whole of the ranges,
+its shares of the unknowns, of length one, and the same in words."""
 
 
 def directions(matrix: Tensor, unknowns: Sequence[Unknown], place: Tensor) -> list[Direction]:
     """The principal directions of the sensitivities J^T W J (U, U) at a place (U,), the best known first."""
     values, vectors = torch.linalg.eigh(matrix)
     found = []
-    for value, vector in zip(values.flip(0), vectors.flip(1).mT, strict=True):
-        parts = tuple(vector.tolist())
+    for value, parts in zip(values.flip(0).tolist(), vectors.flip(1).mT.tolist(), strict=True):
         lead = max(range(len(parts)), key=lambda k: abs(parts[k]))
-        unknown = unknowns[lead]
-        slope, own = unknown.slope(float(place[lead])), unknown.value(float(place[lead]))
+        unknown, share = unknowns[lead], float(place[lead])
+        own = abs(unknown.value(share))
         # how far along the direction until the largest part has changed by a tenth of its value, or of its range
-        far = 0.1 * abs(own) / abs(slope) if own and unknown.scale == "log" else 0.1
+        far = 0.1 * own / abs(unknown.slope(share)) if own and unknown.scale == "log" else 0.1
         told = changes([far / parts[lead] * part for part in parts], unknowns, place)
-        found.append(Direction(math.sqrt(max(float(value), 0.0)), parts, told))
+        found.append((math.sqrt(max(value, 0.0)), parts, told))
     return found
 
 
-def condition(found: Sequence[Direction]) -> float:
-    """Largest singular value over the smallest."""
-    return found[0].strength / max(found[-1].strength, 1e-300)
-
-
 def check_apart(found: Sequence[Direction], unknowns: Sequence[Unknown], limit: float) -> None:
-    """Raise ValueError if the condition number of the directions is above a limit: they cannot be told apart."""
-    if len(unknowns) < 2 or condition(found) <= limit:
+    """Raise ValueError if the largest singular value is more than ``limit`` times the smallest."""
+    (best, *_), (worst, parts, sentence) = found[0], found[-1]
+    condition = best / max(worst, 1e-300)
+    if len(unknowns) < 2 or condition <= limit:
         return
-    worst, told = found[-1], f"(condition {condition(found):.3g}, limit {limit:g})"
-    largest = max(map(abs, worst.parts))
-    names = [f"`{u.name}`" for u, part in zip(unknowns, worst.parts, strict=True) if abs(part) > LARGE * largest]
+    largest, told = max(map(abs, parts)), f"(condition {condition:.3g}, limit {limit:g})"
+    names = [f"`{u.name}`" for u, part in zip(unknowns, parts, strict=True) if abs(part) > LARGE * largest]
     if len(names) == 1:
         raise ValueError(f"The video does not tell {names[0]} {told}: put it into `known`, or raise `limit`.")
     raise ValueError(
-        f"The video cannot tell {', '.join(names[:-1])} and {names[-1]} apart: {worst.sentence} changes nothing that "
+        f"The video cannot tell {', '.join(names[:-1])} and {names[-1]} apart: {sentence} changes nothing that "
         f"is seen {told}. Put one of them into `known`, or raise `limit`."
     )
 

@@ -8,10 +8,12 @@ import os
 from bisect import bisect_left
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
+from copy import copy
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
 from itertools import pairwise
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -69,11 +71,8 @@ class Footage:
         return found if found < len(self.times) and self.times[found] < time + CLOSE else None
 
 
-@dataclass
-class _Shot:
-    time: float
-    camera: Camera
-    image: Tensor
+Shot = tuple[float, Camera, Tensor]
+"""Time [s], camera and image of a frame."""
 
 
 class _Room:
@@ -86,31 +85,19 @@ class _Room:
         pose = counted_pose(world_to_camera, self.origin).float()
         return Camera(pose, lens.intrinsics().float(), lens.width, lens.height, self.near)
 
-    def holds(self, width: int, height: int) -> int:
-        return min(self.frames, self.bytes // (3 * width * height))
-
-    def check(self, path: Path, width: int, height: int, frames: int = 1) -> None:
-        if frames > self.holds(width, height):
+    def take(self, path: Path, width: int, height: int, frames: int = 1) -> None:
+        """Count frames of a file."""
+        self.frames, self.bytes = self.frames - frames, self.bytes - frames * 3 * width * height
+        if min(self.frames, self.bytes) < 0:
             raise ValueError(
                 f"The videos have more than {MOST_FRAMES:,} frames or {MOST_BYTES / 2**30:g} GiB of pixels together "
                 f"({path}, {width} x {height}): cut them to the motion that is fitted and predicted, make them "
                 "smaller, or choose `cameras`."
             )
 
-    def take(self, path: Path, width: int, height: int) -> None:
-        """Count one more frame of a file."""
-        self.check(path, width, height)
-        self.frames -= 1
-        self.bytes -= 3 * width * height
 
-
-@dataclass(frozen=True)
-class _Part:
-    """Frames of one camera that are not decoded yet, from a time [s] on; ``lost`` is a picture that does not exist."""
-
-    begin: float
-    read: Callable[[_Room], list[_Shot]]
-    lost: Path | None = None
+Part = tuple[float, Callable[[_Room], list[Shot]] | Path]
+"""Frames of one camera from a time [s] on, which are not decoded yet; or the picture that does not exist."""
 
 
 def read_videos(
@@ -119,7 +106,7 @@ def read_videos(
     size: float = 1.0,
     origin: Origin = NO_ORIGIN,
 ) -> list[Footage]:
-    """Read the videos of one motion.
+    """Read the videos of one motion, one for each camera, sorted by name. The earliest frame is at time zero.
 
     docs/fit.md describes ``transforms.json`` of a folder. Cameras that are not wanted are not decoded; the others
     together may have :data:`MOST_FRAMES` and :data:`MOST_BYTES`.
@@ -129,23 +116,20 @@ def read_videos(
         cameras: Names of the cameras that are wanted; None for all.
         size: Size of what they show [scene units], which the near plane of the cameras follows.
         origin: Point of the files from which the places of the splat count.
-
-    Returns:
-        One for each camera, sorted by name. The earliest frame is at time zero.
     """
     several = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
     if not several:
         raise ValueError("Expected `videos` to name a folder with transforms.json.")
-    parts: dict[str, list[_Part]] = {}
+    parts: dict[str, list[Part]] = {}
     for number, path in enumerate(map(Path, several)):
-        found = _read(path)
-        for name, own in found.items():
+        for name, own in _read(path).items():
             parts.setdefault(name if len(several) == 1 or name not in parts else f"{number}-{name}", []).extend(own)
-    begin = min(part.begin for own in parts.values() for part in own)
+    begin = min(time for own in parts.values() for time, _ in own)
     for name in cameras or ():
         if name not in parts:
             raise ValueError(f"There is no camera {name!r} in `videos`: `cameras` may be {', '.join(sorted(parts))}.")
-    lost = [part.lost for name in sorted(cameras or parts) for part in parts[name] if part.lost]
+    wanted = {name: parts[name] for name in sorted(cameras or parts)}
+    lost = [part for own in wanted.values() for _, part in own if isinstance(part, Path)]
     if lost:
         raise ValueError(
             f"{len(lost)} of the pictures of `videos` do not exist, the first of them {lost[0]}: put them there, or "
@@ -153,8 +137,8 @@ def read_videos(
         )
     room = _Room(NEAR * size, origin)
     return [
-        _footage(name, [shot for part in parts[name] for shot in part.read(room)], begin)
-        for name in sorted(cameras or parts)
+        _footage(name, [shot for _, part in own if not isinstance(part, Path) for shot in part(room)], begin)
+        for name, own in wanted.items()
     ]
 
 
@@ -167,54 +151,42 @@ def frame_times(videos: Sequence[Footage]) -> list[float]:
     return found
 
 
-def _footage(name: str, shots: list[_Shot], begin: float) -> Footage:
-    shots = sorted(shots, key=lambda shot: shot.time)
-    times = [shot.time - begin for shot in shots]
-    for before, after in pairwise(times):
+def _footage(name: str, shots: list[Shot], begin: float) -> Footage:
+    taken, cameras, images = zip(*sorted(shots, key=itemgetter(0)), strict=True) if shots else ((), (), ())
+    for before, after in pairwise(taken):
         if after - before < 1e-6:
             raise ValueError(
-                f"The camera {name!r} has two frames at {after + begin:g} s: give every camera its own `camera` in "
+                f"The camera {name!r} has two frames at {after:g} s: give every camera its own `camera` in "
                 "transforms.json, and every frame its `time`."
             )
-    sizes = {tuple(shot.image.shape[:2]) for shot in shots}
+    sizes = {tuple(image.shape[:2]) for image in images}
     if len(sizes) > 1:
         raise ValueError(f"The frames of camera {name!r} have different sizes: {sorted(sizes)}; make them equal.")
-    if len(shots) < 3:
-        raise ValueError(f"The camera {name!r} has {len(shots)} frames: a motion needs three or more.")
-    images = torch.stack([shot.image for shot in shots])
-    return Footage(name, tuple(times), tuple(shot.camera for shot in shots), images)
+    if len(images) < 3:
+        raise ValueError(f"The camera {name!r} has {len(images)} frames: a motion needs three or more.")
+    return Footage(name, tuple(time - begin for time in taken), cameras, torch.stack(images))
 
 
-def _read(path: Path) -> dict[str, list[_Part]]:
+def _read(path: Path) -> dict[str, list[Part]]:
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist: set `videos` to a folder with transforms.json.")
     files = transforms_files(path)
     if not files:
         raise ValueError(f"{path} has no transforms.json: write one with the cameras and times of the frames.")
-    parts: dict[str, list[_Part]] = {}
+    parts: dict[str, list[Part]] = {}
     for file, _ in files:
         data, where = load_transforms(file), f"`{file}`"
-        frames = data["frames"]
-        films = [k for k, frame in enumerate(frames) if "video_path" in frame]
-        for k in films:
-            begin = read_number(where, frames[k], "time") or 0.0
-            part = _Part(begin, partial(_film, file, where, data, k, begin))
-            parts.setdefault(_camera_name(where, k, frames[k]), []).append(part)
-        if len(films) == len(frames):
-            continue
-        posed = {item.name: item for item in read_transforms(file)[0]}
-        for k, frame in enumerate(frames):
-            name = clean_name(str(frame.get("file_path", "")))
-            if "video_path" in frame:
-                continue
+        stills = any("video_path" not in frame for frame in data["frames"])
+        posed = {item.name: item for item in read_transforms(file)[0]} if stills else {}
+        for k, frame in enumerate(data["frames"]):
             time = read_number(where, frame, "time")
-            if time is None:
-                raise ValueError(f"The field `frames[{k}].time` of the camera file {where} is missing: add it [s].")
-            if name in posed:
-                part = _Part(time, partial(_picture, posed[name], time))
-            else:
-                part = _Part(time, lambda room: [], lost=file.parent / name)
-            parts.setdefault(_camera_name(where, k, frame), []).append(part)
+            own: Callable[[_Room], list[Shot]] | Path = partial(_film, file, where, data, k, time or 0.0)
+            if "video_path" not in frame:
+                name = clean_name(str(frame.get("file_path", "")))
+                if time is None:
+                    raise ValueError(f"The field `frames[{k}].time` of the camera file {where} is missing: add it [s].")
+                own = partial(_picture, posed[name], time) if name in posed else file.parent / name
+            parts.setdefault(_camera_name(where, k, frame), []).append((time or 0.0, own))
     return parts
 
 
@@ -229,21 +201,21 @@ def _camera_name(where: str, index: int, frame: dict[str, Any]) -> str:
     return name
 
 
-def _picture(item: PosedImage, time: float, room: _Room) -> list[_Shot]:
+def _picture(item: PosedImage, time: float, room: _Room) -> list[Shot]:
     room.take(item.path, item.lens.width, item.lens.height)
     camera = room.camera(item.world_to_camera, item.lens.undistorted())
     turned = is_turned(*image_head(item.path), (item.lens.width, item.lens.height))
     pixels = load_image(item.path, item.lens, turned=bool(turned))
-    return [_Shot(time, camera, pixels[..., :3].contiguous())]
+    return [(time, camera, pixels[..., :3].contiguous())]
 
 
-def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float, room: _Room) -> list[_Shot]:
+def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float, room: _Room) -> list[Shot]:
     """The frames of a video file, decoded one by one as long as there is room."""
     entry = data["frames"][index]
     path = check_regular(file.parent / str(entry["video_path"]), "the video")
     fps, begun, seconds = (read_number(where, entry, name) for name in ("fps", "begin", "seconds"))
     wanted = [read_number(where, {name: data.get(name)} | entry, name) for name in ("w", "h")]
-    shots: list[_Shot] = []
+    shots: list[Shot] = []
     taken = [] if not begun else ["-ss", f"{begun:.6f}"]
     taken += [] if seconds is None else ["-t", f"{seconds:.6f}"]
     with closing(frames_of(path, taken, ["-frames:v", str(room.frames + 1), *scaled(*wanted)])) as film:
@@ -260,13 +232,13 @@ def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float
         if not rate > 0:
             raise ValueError(f"The video {path} does not say its frame rate: add `fps` to its entry in {where}.")
         length = min(head["duration"] - (begun or 0), math.inf if seconds is None else seconds)
-        room.check(path, *size, frames=int(head["fps"] * max(length, 0)))  # what it says; it may have more
+        copy(room).take(path, *size, frames=int(head["fps"] * max(length, 0)))  # what it says; it may have more
         while (frame := next_of(film, path)) is not None:
             room.take(path, *size)
             picture = torch.frombuffer(bytearray(frame), dtype=torch.uint8).reshape(size[1], size[0], 3)
             if lens.distorted:
                 picture = remapped(picture, lens)
-            shots.append(_Shot(begin + len(shots) / rate, camera, picture))
+            shots.append((begin + len(shots) / rate, camera, picture))
     if not shots and 0 < head["duration"] <= (begun or 0):
         raise ValueError(
             f"The field `frames[{index}].begin` of the camera file {where} is {begun:g} s, behind the end of the film "

@@ -57,7 +57,6 @@ class Block:
 
     @property
     def floating(self) -> bool:
-        """True if the numbers are floating point numbers."""
         return self.kind[0] == "f"
 
 
@@ -81,13 +80,13 @@ Value = Any
 
 
 def is_number(value: Value) -> bool:
-    """True if a value is a number that is known when the kernel is translated."""
+    """True if a value is a number known at translation."""
     return isinstance(value, (bool, int, float))
 
 
 @lru_cache(maxsize=4096)
 def _constant(number: Any, sign: float, kind: str, shape: Shape) -> Block:
-    """A block of one number; LLVM's value of it is immutable, and writes itself once."""
+    """LLVM's constant is immutable, and writes itself once."""
     lanes = math.prod(shape)
     if lanes == 1:
         return Block(ir.Constant(TYPES[kind], number), kind, shape)
@@ -163,11 +162,9 @@ class Emitter:
         return made
 
     def _float_to_int(self, block: Block, to: ir.Type) -> Any:
-        """As a GPU does: the nearest integer towards zero; for NaN and beyond the range the nearest that there is."""
         return self.intrinsic("llvm.fptosi.sat", [block.value], to, [to, block.value.type])
 
     def splat(self, block: Block, shape: Shape) -> Block:
-        """A block repeated to a shape."""
         lanes = math.prod(shape)
         if block.lanes == lanes:
             return block if block.shape == shape else replace(block, shape=shape)
@@ -185,7 +182,7 @@ class Emitter:
     @staticmethod
     @lru_cache(maxsize=4096)
     def common_shape(*shapes: Shape) -> Shape:
-        """The shape to which blocks are repeated before an operation."""
+        """The shape to which the blocks of an operation are broadcast."""
         rank = max(map(len, shapes))
         padded = [(1,) * (rank - len(shape)) + shape for shape in shapes]
         found = tuple(max(sizes) for sizes in zip(*padded, strict=True))
@@ -197,7 +194,6 @@ class Emitter:
         return found
 
     def matched(self, *values: Value) -> list[Block]:
-        """Blocks of one type and shape."""
         blocks = [value for value in values if isinstance(value, Block)]
         best = max(blocks, key=lambda block: ORDER.index(block.kind)) if blocks else None
         made = [self.block(value, best) for value in values]
@@ -225,7 +221,6 @@ class Emitter:
         return Block(value, block.kind, block.shape)
 
     def absolute(self, x: Block) -> Block:
-        """|x|."""
         if x.floating:
             return self.unary("fabs", x)
         return self.where(self.compare("<", x, 0), self.arithmetic("-", 0, x), x)
@@ -256,17 +251,15 @@ class Emitter:
         return self._with_stride(made, sign, a, b) if sign in "+-*" and a.lanes > 1 else made
 
     def rounded(self, sign: str, x: Value, y: Value) -> Block:
-        """A sum, product or quotient that is rounded as written: no part of it is fused with another."""
+        """A sum, product or quotient without FMA contraction."""
         a, b = self.matched(x, y)
         made = {"+": self.builder.fadd, "*": self.builder.fmul, "/": self.builder.fdiv}[sign](a.value, b.value)
         return Block(made, a.kind, a.shape)
 
     def negative(self, x: Block) -> Block:
-        """-x, of floating point numbers."""
         return Block(self.builder.fneg(x.value), x.kind, x.shape)
 
     def bits(self, x: Block, kind: str) -> Block:
-        """The bits of numbers as those of another type."""
         return Block(self.builder.bitcast(x.value, self.type_of(kind, x.lanes)), kind, x.shape)
 
     def _with_stride(self, made: Block, sign: str, a: Block, b: Block) -> Block:
@@ -284,7 +277,6 @@ class Emitter:
         return replace(made, first=first, stride=a.stride + (b.stride if sign == "+" else -b.stride))
 
     def compare(self, sign: str, x: Value, y: Value) -> Block:
-        """X sign y, true or false."""
         a, b = self.matched(x, y)
         if a.floating:
             make = self.builder.fcmp_unordered if sign == "!=" else self.builder.fcmp_ordered
@@ -308,7 +300,6 @@ class Emitter:
         return self.where(self.compare(">" if which == "max" else "<", a, b), a, b)
 
     def arange(self, start: int, end: int) -> Block:
-        """The integers from start to before end."""
         shape = (end - start,)
         if shape == (1,):
             return self.constant(start, "i32", shape)
@@ -316,7 +307,6 @@ class Emitter:
         return Block(value, "i32", shape, ir.Constant(TYPES["i32"], start), 1)
 
     def reduce(self, which: str, x: Block, axis: int | None = None) -> Block:
-        """``sum``, ``max`` or ``min`` over an axis, or over all."""
         if x.kind == "i1":
             x = self.convert(x, "i32")
         shape = () if axis is None else x.shape[:axis] + x.shape[axis + 1 :]
@@ -347,7 +337,6 @@ class Emitter:
         return b.extract_element(value, index(0))
 
     def running_sum(self, x: Block) -> Block:
-        """Sums of each lane and all before it."""
         if x.lanes == 1:
             return replace(x, first=None)
         value, index, b, lanes = x.value, ir.IntType(32), self.builder, x.lanes
@@ -372,12 +361,10 @@ class Emitter:
         return self._dummy[kind]
 
     def _where(self, pointer: Pointer, mask: Value, *blocks: Block) -> tuple[Block | None, Shape]:
-        """A mask, if it is not all true, and the shape of a pointer, the mask and some blocks."""
         mask = None if mask is None or mask is True else self.convert(self.block(mask), "i1")
         return mask, self.common_shape(*(each.shape for each in (pointer.offset, *blocks, mask) if each is not None))
 
     def load(self, pointer: Pointer, mask: Value = None, other: Value = None) -> Block:
-        """The numbers at some addresses; ``other`` (or zero) where a mask is false."""
         kind = pointer.kind
         stored = "i8" if kind == "i1" else kind
         offset = pointer.offset
@@ -413,7 +400,6 @@ class Emitter:
         return self.convert(made, "i1") if kind == "i1" else made
 
     def store(self, pointer: Pointer, value: Value, mask: Value = None) -> None:
-        """Write numbers to some addresses, where a mask is true."""
         kind = pointer.kind
         stored = "i8" if kind == "i1" else kind
         offset = pointer.offset
@@ -460,7 +446,7 @@ class Emitter:
         return self.intrinsic(f"llvm.masked.{what}", arguments, to, types)
 
     def atomic(self, operation: str, pointer: Pointer, value: Value, mask: Value = None) -> Block:
-        """Add to a number in memory, or make it as large, one lane after the other; returns what it was before."""
+        """Atomic ``add`` or ``max`` on memory, lane after lane; returns the old values."""
         block = self.convert(self.block(value), pointer.kind)
         mask, shape = self._where(pointer, mask, block)
         b, index = self.builder, ir.IntType(32)

@@ -136,7 +136,6 @@ def _linker() -> Any:
 
 
 def _compiled(text: str, machine: Any = None) -> bytes:
-    """An object file from LLVM's text, for this processor if no other code generator is given."""
     llvm, machine = _llvm(), machine or _machine()
     module = llvm.parse_assembly(text)
     module.verify()
@@ -165,7 +164,6 @@ _spent = [0, 0.0, 0.0]
 
 
 def _address(kernel: Any, constants: dict[str, Any], kinds: dict[str, str], real: str) -> int:
-    """The address of a compiled kernel: from memory, from disk, or compiled now."""
     key = (kernel, tuple(constants.items()), tuple(kinds.values()), real)
     address = _COMPILED.get(key)
     if address is None:
@@ -206,7 +204,7 @@ def _found_or_compiled(kernel: Any, constants: dict[str, Any], kinds: dict[str, 
 
 
 def compiled() -> tuple[int, float, float]:
-    """Number of kernels that this process has compiled for the CPU; wall-clock and processor time that it took [s]."""
+    """Number of kernels compiled by this process for the CPU, with wall-clock and processor time [s]."""
     return int(_spent[0]), _spent[1], _spent[2]
 
 
@@ -298,7 +296,7 @@ def _run_rows(rows: Any, launches: int) -> None:
 
 
 class Recording:
-    """Launches, and functions between them, that can be run again; their tensors must stay where they are."""
+    """Launches, and functions between them, to run again. The tensors must stay where they are."""
 
     def __init__(self) -> None:
         self.parts: list[list[tuple[int, Any, int]] | Callable[[], object]] = []
@@ -333,7 +331,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class Noted:
-    """A launch that was noted: what is compiled for it, the grid and its arguments in words of eight bytes, tensors."""
+    """A noted launch: its compile key, grid, arguments as 8-byte words, and tensors."""
 
     kernel: Any
     constants: dict[str, Any]
@@ -344,12 +342,10 @@ class Noted:
 
     @property
     def key(self) -> Any:
-        """What is compiled."""
         return self.kernel, tuple(self.constants.items()), tuple(self.kinds.values()), self.real
 
     @property
     def programs(self) -> int:
-        """Number of its programs."""
         return int(math.prod(self.arguments[:3]))
 
 
@@ -363,7 +359,7 @@ _current = _Current()
 
 @contextmanager
 def recording() -> Iterator[Recording]:
-    """Within the block, launches of this thread and functions passed to :func:`call` are recorded while they run."""
+    """Within the block, record launches of this thread and functions passed to :func:`call`, while they run."""
     outer, made = _current.recording, Recording()
     _current.recording = made
     try:
@@ -374,7 +370,7 @@ def recording() -> Iterator[Recording]:
 
 @contextmanager
 def noted() -> Iterator[list[Noted]]:
-    """Within the block, launches of this thread are noted but not run, and what :func:`call` gets is left out."""
+    """Within the block, note launches of this thread without running them; functions of :func:`call` are skipped."""
     made: list[Noted] = []
     _current.notes = made
     try:
@@ -384,7 +380,7 @@ def noted() -> Iterator[list[Noted]]:
 
 
 def call(change: Callable[[], object]) -> None:
-    """Call a function between launches, and note it if they are recorded."""
+    """Call a function between launches, and add it to a recording if there is one."""
     if _current.notes is not None:
         return
     change()
@@ -409,9 +405,6 @@ def launch(kernel: Any, grid: Sequence[int], *given: Any, **named: Any) -> None:
     Its real numbers are of double precision if it gets tensors of them and none of single precision.
 
     Args:
-        kernel: The kernel.
-        grid: Number of programs along each of up to three axes.
-        given: Its first arguments: contiguous tensors, numbers, constants.
         named: Its other arguments; those that only a GPU needs are ignored.
     """
     names, constant = _parameters(kernel)

@@ -41,7 +41,7 @@ class TraceError(ValueError):
 
 @dataclass(frozen=True)
 class Primitive:
-    """What is known of a device function that is called as a whole.
+    """Known facts about a device function that is called as a whole.
 
     Attributes:
         outputs: Shape of its result: 0 for a number, n for a tuple of n, a tuple of shapes for several.
@@ -79,7 +79,7 @@ _REAL: ContextVar[torch.dtype] = ContextVar("real", default=torch.float32)
 
 
 def primitive(function: Any, outputs: Any = 0, **known: Any) -> None:
-    """Say what is known of a device function, see :class:`Primitive`."""
+    """Register known facts about a device function, see :class:`Primitive`."""
     _PRIMITIVES[function] = Primitive(outputs, **known)
 
 
@@ -87,13 +87,9 @@ def primitive(function: Any, outputs: Any = 0, **known: Any) -> None:
 
 
 def on_tensors(function: Any, look_in: bool = False) -> Callable[..., Any]:
-    """The Python function of a device function: takes and returns tensors, numbers or symbols, and tuples of them.
+    """Run a device function in Python, on tensors, numbers or symbols, and tuples of them.
 
     Constants are plain numbers and tuples. Tensors must broadcast; results have their type, device and gradient.
-
-    Args:
-        function: The device function.
-        look_in: Whether to run the text of a primitive, too.
 
     Raises:
         TraceError: When it is called, if the function loads from memory or branches on a value.
@@ -138,7 +134,6 @@ def _call(function: Any, *given: Any, **named: Any) -> Any:
 
 @cache
 def _python(function: Any) -> Callable[..., Any]:
-    """The text of a device function with the torch version of the language in place of Triton's."""
     lines, first = inspect.getsourcelines(function.fn)
     tree = ast.parse(textwrap.dedent("".join(lines)))
     made = next(node for node in tree.body if isinstance(node, ast.FunctionDef))
@@ -289,7 +284,7 @@ def _graph_of(*values: Any) -> Graph | None:
 
 
 class Symbol:
-    """A number that is not known yet: what it is computed from."""
+    """An unknown number: an operation and its arguments."""
 
     __slots__ = ("args", "graph", "index", "op")
 
@@ -323,7 +318,7 @@ for _op, _name in {"<": "lt", "<=": "le", ">": "gt", ">=": "ge", "==": "eq", "!=
 
 
 class Graph:
-    """All symbols of a trace; equal ones are one."""
+    """All symbols of a trace; equal symbols are shared."""
 
     def __init__(self) -> None:
         self._known: dict[tuple[Any, ...], Symbol] = {}
@@ -341,13 +336,11 @@ class Graph:
         return self._known[key]
 
     def argument(self, name: str, shape: Shape) -> Any:
-        """The symbols of an argument."""
         if shape == 0:
             return self.make("argument", name)
         return tuple(self.make("argument", f"{name}[{k}]") for k in range(shape))
 
     def call(self, function: Any, known: Primitive, given: tuple[Any, ...]) -> Any:
-        """The symbols of the result of a primitive."""
         whole = self.make("call", function, given)
 
         def parts(shape: Any, place: str) -> Any:
@@ -419,7 +412,7 @@ def _simplified(op: str, args: tuple[Any, ...]) -> Any:
 
 
 def gradient(outputs: Sequence[Any], inputs: Any, bars: Sequence[Any] | None = None) -> Any:
-    """Gradients of the sum of some numbers, times ``bars``, by the symbols of ``inputs``, in their structure."""
+    """Gradients of the sum of some numbers, weighted with ``bars``, by the symbols ``inputs``, in their structure."""
     order = _order(outputs)
     bar: dict[Any, Any] = {}
     calls: dict[Symbol, dict[str, Any]] = {}
@@ -449,7 +442,6 @@ def gradient(outputs: Sequence[Any], inputs: Any, bars: Sequence[Any] | None = N
 
 
 def _order(outputs: Sequence[Any]) -> list[Symbol]:
-    """All symbols that some need, each after those that it needs."""
     seen: set[int] = set()
     order: list[Symbol] = []
     pending: list[tuple[Any, bool]] = [(output, False) for output in reversed(list(_leaves(tuple(outputs))))]
@@ -538,11 +530,7 @@ def difference(output: Any, inputs: Sequence[Symbol], others: Sequence[Any], ste
     """(f(x) - f(y)) / gap without cancellation, from f(x) and y.
 
     Args:
-        output: f(x).
-        inputs: x.
-        others: y.
         steps: The entries of x - y as multiples of the gap.
-        gap: The gap.
     """
     order = _order([output])
     there: dict[int, Any] = {}
@@ -623,7 +611,6 @@ def _moved(node: Symbol, moves: list[Any], at: Callable[[Any], Any], end: Any, g
 
 
 def _share_above(x: Any, y: Any, floor: Any) -> Any:
-    """Share of the way from y to x that lies above a floor."""
     make, gap = x.graph.make, x - y
     none = make("==", gap, 0.0)
     above = (make("maximum", x, floor) - make("maximum", y, floor)) / make("where", none, 1.0, gap)
@@ -637,7 +624,6 @@ def device_function(name: str, shapes: dict[str, Shape], formula: Callable[..., 
     """A device function from a formula of symbols.
 
     Args:
-        name: Its name; a part that identifies its text is added.
         shapes: The shapes of its arguments, by name.
         formula: Takes the symbols and returns a number or a tuple; it may call ``on_tensors(function)``.
     """
@@ -656,7 +642,6 @@ def device_function(name: str, shapes: dict[str, Shape], formula: Callable[..., 
 
 
 def _body(result: Any) -> tuple[str, dict[str, Any]]:
-    """The statements that compute a result, and the functions that they call."""
     names: dict[int, str] = {}
     known: dict[str, Any] = {}
     lines: list[str] = []
@@ -705,10 +690,7 @@ def vjp(function: Any, shapes: dict[str, Shape], by: Sequence[str], constants: d
     argument.
 
     Args:
-        function: The device function.
         shapes: Shapes of the arguments that are numbers, by name.
-        by: Names of the arguments by which gradients are wanted.
-        constants: The other arguments.
     """
     graph = Graph()
     given = {key: graph.argument(key, shape) for key, shape in shapes.items()}
@@ -726,7 +708,7 @@ def vjp(function: Any, shapes: dict[str, Shape], by: Sequence[str], constants: d
 
 
 def uses(function: Any, shapes: dict[str, Shape]) -> set[str]:
-    """Names of the arguments that the result of a device function depends on."""
+    """Names of the arguments that affect the result of a device function."""
     graph = Graph()
     result = on_tensors(function)(**{key: graph.argument(key, shape) for key, shape in shapes.items()})
     return {node.args[0].split("[")[0] for node in _order([result]) if node.op == "argument"}
@@ -745,7 +727,7 @@ class _Unknown(Symbol):
 
 
 def canonical(function: Any) -> str:
-    """What a device function computes, with its arguments by number: the same text for the same formula.
+    """A canonical text of a device function: the same for the same formula, whatever its names.
 
     Raises:
         TraceError: If it cannot be traced.

@@ -44,17 +44,16 @@ class Component(Fixed):
             cls.device_function = Component.device_function  # type: ignore[method-assign]
 
     def device_function(self) -> Any:
-        """The ``DeviceFunction``; None for a component that runs in torch only. Cheap: numbers are taken later."""
+        """The ``DeviceFunction``, with numbers read lazily; None if the component runs in torch only."""
         return None
 
     def nearest_device_function(self) -> Any:
-        """The device function, or else that of the nearest base that has one."""
         own = (vars(kind).get("device_function", Component.device_function) for kind in type(self).__mro__)
         return next((one for one in own if one is not Component.device_function), Component.device_function)(self)
 
 
 def recorded_key(modules: Sequence[nn.Module]) -> tuple[object, ...]:
-    """What a recording of modules depends on: other objects, addresses of tensors or settings need another recording.
+    """Key of a recording of modules; it changes with their objects, tensor addresses and settings.
 
     What is in the tensors is read at each replay. An assignment to a module that is no ``Fixed`` is not detected, nor
     one within another object.
@@ -70,14 +69,13 @@ def tensors_in(modules: Iterable[nn.Module]) -> list[torch.Tensor]:
 
 
 def _parts(modules: Iterable[nn.Module]) -> Iterator[nn.Module]:
-    """Yield modules, each followed by all that it contains."""
     for module in modules:
         yield module
         yield from _parts(child for child in vars(module)["_modules"].values() if child is not None)
 
 
 class Replayed:
-    """Calls a function of tensors, and replays it from a CUDA graph from the second call in a row with the same key on.
+    """Calls a function of tensors; from the second consecutive call with the same key on, replays a CUDA graph.
 
     Many small kernels take longer to start than to run. Only the last recording is kept.
     """
@@ -95,7 +93,7 @@ class Replayed:
     def __call__(
         self, key: Hashable, function: Callable[..., Sequence[torch.Tensor]], *inputs: torch.Tensor
     ) -> list[torch.Tensor]:
-        """The results of the function, in tensors of their own.
+        """The results of the function, as new tensors.
 
         Args:
             key: Identifies all else that the function depends on, besides its inputs.
@@ -153,10 +151,7 @@ class Repeater:
         After that it is recorded and replayed. On a CPU it is recorded while it runs for the first time.
 
         Args:
-            times: Number of repetitions.
-            key: Identifies the work.
             work: Runs it once; its argument is how often it ran since ``counter`` changed.
-            recordable: Whether it may be recorded.
             launches: Whether it consists of launches of kernels, and of calls by ``kernels.launch.call``; only then is
                 it recorded on a CPU.
             counter: A whole number on the device that is to grow by one each time.
@@ -190,7 +185,6 @@ class Repeater:
                 times -= size
 
     def _run_on_cpu(self, times: int, key: Hashable, several: Callable[[int], None]) -> None:
-        """As :meth:`run`; the launches of the first time are kept, and run again without Python in between."""
         from gaussian_swaying.kernels.cpu import recording
 
         while key not in self._graphs and len(self._graphs) >= self.kept:
@@ -260,7 +254,6 @@ class Repeater:
         return graph
 
     def forget(self, key: Hashable | None = None) -> None:
-        """Drop the graphs of one key, or all of them."""
         for known in list(self._graphs) if key is None else [key]:
             for graph in self._graphs.pop(known, {}).values():
                 graph.reset()

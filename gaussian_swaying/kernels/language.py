@@ -29,7 +29,7 @@ class Constant:
 
 
 class Name:
-    """A name of the language, such as ``load`` or ``PropagateNan.ALL``, which only the translator understands."""
+    """A name of Triton's language, such as ``load``, that only the translator understands."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -65,7 +65,6 @@ class Function:
 
 
 def _note(function: Function, found: dict[str, str]) -> None:
-    """Add the source of a function, of those that it calls, and the constants of their modules, by name."""
     found[repr(function)] = inspect.getsource(function.fn)
     names = function.fn.__code__.co_names
     homes = [function.fn.__globals__]
@@ -91,7 +90,7 @@ class Language:
 
 
 class Compiler:
-    """As ``triton``, as far as kernel files and those that launch them need it."""
+    """Stand-in for ``triton``, as far as this package needs it."""
 
     language = Language()
 
@@ -101,7 +100,6 @@ class Compiler:
 
     @staticmethod
     def cdiv(x: int, y: int) -> int:
-        """X / y, rounded up."""
         return -(-x // y)
 
     @staticmethod

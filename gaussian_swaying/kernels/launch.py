@@ -48,12 +48,11 @@ def compiles(device: str) -> bool:
 
 
 def replaces(given: Iterable[Tensor], dtype: torch.dtype | None = torch.float32) -> bool:
-    """True if a kernel without gradients may replace torch functions: it compiles, and none of the tensors forbids it.
+    """True if a kernel without gradients may replace torch functions on these tensors.
 
     Triton's interpreter replaces nothing, as it takes far longer.
 
     Args:
-        given: All tensors that the result depends on, on one device.
         dtype: The only type that the kernel takes; None for any.
     """
     known = list(given)
@@ -64,13 +63,13 @@ def replaces(given: Iterable[Tensor], dtype: torch.dtype | None = torch.float32)
 
 
 def lanes(device: torch.device, gpu: int, cpu: int | None = None) -> int:
-    """The size of a block: that for a GPU, or for a CPU, whose blocks have one axis that is longer than one."""
+    """Block size for a device: ``gpu``, or ``cpu``, where blocks have one long axis."""
     return gpu if device.type == "cuda" or INTERPRETED else _LANES.get() if cpu is None else cpu
 
 
 @contextmanager
 def narrowed(count: int) -> Iterator[None]:
-    """Within the block, programs on a CPU have so many lanes, where this thread starts them."""
+    """Within the block, programs that this thread launches on a CPU have ``count`` lanes."""
     token = _LANES.set(count)
     try:
         yield
@@ -79,7 +78,7 @@ def narrowed(count: int) -> Iterator[None]:
 
 
 def wide(device: torch.device) -> bool:
-    """True if one instruction of the device can add four numbers in a row: NVIDIA's GPUs from 9.0 on."""
+    """True if the device adds four numbers atomically in one instruction (NVIDIA, from 9.0 on)."""
     return device.type == "cuda" and not INTERPRETED and torch.cuda.get_device_capability(device) >= (9, 0)
 
 
@@ -88,10 +87,6 @@ def launch(kernel: Any, grid: Sequence[int]) -> Callable[..., None]:
 
     It takes the arguments of the kernel, of which tensors are contiguous and on one device, and options of Triton,
     which a CPU does not need.
-
-    Args:
-        kernel: The kernel.
-        grid: Number of programs along each of up to three axes.
     """
 
     def run(*given: Any, **named: Any) -> None:
@@ -107,7 +102,7 @@ def launch(kernel: Any, grid: Sequence[int]) -> Callable[..., None]:
 
 
 def call(change: Callable[[], object], device: torch.device) -> None:
-    """Call a function between launches on a device; where launches are recorded, it is called again with them."""
+    """Call a function between launches on a device; in a recording it becomes part of the replay."""
     if device.type == "cuda" or INTERPRETED:
         change()
         return

@@ -56,8 +56,6 @@ def translate(kernel: Any, constants: dict[str, Any], arguments: dict[str, str],
     integers and doubles.
 
     Args:
-        kernel: The kernel.
-        constants: Its constant arguments.
         arguments: The kinds of the others, in order: ``i`` and ``f`` for a number, ``*`` and a type for a pointer.
         real: Type of floating point numbers: f32 or f64.
     """
@@ -79,7 +77,6 @@ class Translator(Emitter):
     def kernel(
         self, kernel: Any, constants: dict[str, Any], arguments: dict[str, str], name: str = "kernel"
     ) -> ir.Module:
-        """Add the function of a kernel to the module, under some name."""
         number = TYPES["i64"]
         kind = ir.FunctionType(ir.VoidType(), [ADDRESS, number, number])
         function = ir.Function(self.module, kind, name)
@@ -130,7 +127,6 @@ class Translator(Emitter):
         return self.convert(Block(self._slot(rows, k, TYPES["i64"]), "i64"), "i32" if what == "i" else "i64")
 
     def _place(self, program: Any) -> list[Any]:
-        """The three numbers of a program from its number in the grid; the first one changes fastest."""
         b, (x, y, _) = self.builder, self._grid
         rest = b.sdiv(program, x.value)
         return [b.srem(program, x.value), b.srem(rest, y.value), b.sdiv(rest, y.value)]
@@ -342,7 +338,6 @@ class Translator(Emitter):
         scope.update({name: self._kept(places[name], kinds[name]) for name in places})
 
     def _joined(self, kinds: dict[str, Any], before: Scope, after: Scope) -> dict[str, Any]:
-        """The types of variables that have values of some types before a loop and others after it."""
         here, scratch = self.builder.block, ir.Function(ir.Module(), ir.FunctionType(ir.VoidType(), []), "scratch")
         self.builder.position_at_end(scratch.append_basic_block())  # what is converted here is of no use
         joined = {name: self._join(self._fit(before[name], kind), after[name]) for name, kind in kinds.items()}
@@ -352,7 +347,6 @@ class Translator(Emitter):
     # ---- values that depend on the way
 
     def _join(self, x: Value, y: Value) -> Any:
-        """The type of a variable that is x on one way and y on another: a nest of (kind, shape) or pointers."""
         if isinstance(x, tuple) and isinstance(y, tuple) and len(x) == len(y):
             return tuple(self._join(a, b) for a, b in zip(x, y, strict=True))
         if isinstance(x, Pointer) and isinstance(y, Pointer) and x.base is y.base:
@@ -365,7 +359,6 @@ class Translator(Emitter):
         raise TranslationError(f"a variable is {x!r} on one way and {y!r} on another")
 
     def _fit(self, value: Value, kind: Any) -> Value:
-        """A value as the type that :meth:`_join` returned."""
         if isinstance(kind, tuple):
             return tuple(self._fit(part, own) for part, own in zip(value, kind, strict=True))
         if isinstance(kind, _Address):
@@ -385,7 +378,6 @@ class Translator(Emitter):
             yield value
 
     def _made(self, kind: Any, values: Iterator[Any]) -> Value:
-        """A value of a type from LLVM values, in the order of :meth:`_leaves`."""
         if isinstance(kind, tuple):
             return tuple(self._made(part, values) for part in kind)
         if isinstance(kind, _Address):
@@ -492,7 +484,6 @@ class Translator(Emitter):
         return self.compare(sign, x, y) if isinstance(x, Block) or isinstance(y, Block) else plain(x, y)
 
     def _logic(self, op: ast.boolop, values: list[ast.expr], scope: Scope) -> Value:
-        """``and`` and ``or``; after a constant that decides, the rest is not looked at."""
         stops = isinstance(op, ast.Or)
         made: Value = not stops
         for value in values:
@@ -567,7 +558,6 @@ class Translator(Emitter):
     # ---- the language
 
     def _named(self, name: str) -> Callable[..., Value]:
-        """A function of the language."""
         match name:
             case "load" | "store" | "where" | "arange":
                 return getattr(self, name)

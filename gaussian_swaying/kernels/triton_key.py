@@ -25,7 +25,6 @@ def remembered(key: Callable[[], str], root: Path) -> str:
     """The hash from its file if nothing in a folder has changed since, or else from the function; it is then kept.
 
     Args:
-        key: Computes the hash.
         root: The folder of Triton. Names, sizes and times of its modules and its library tell of a change.
     """
     files = sorted([*root.rglob("*.py"), *root.glob("_C/libtriton.*")])

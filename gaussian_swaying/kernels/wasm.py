@@ -61,7 +61,6 @@ class _Translator(Translator):
     unrolled = 2
 
     def extreme(self, which: str, x: Value, y: Value, nan: bool = False) -> Block:
-        """See ``Emitter``; by comparisons."""
         a, b = self.matched(x, y)
         if nan or not a.floating:
             return super().extreme(which, a, b, nan)
@@ -75,9 +74,7 @@ def image(
     """The module of some noted launches, and the memory as it is now.
 
     Args:
-        launches: The launches, by the names of their functions.
         tensors: Contiguous tensors whose places in the memory are wanted; launches may use them or not.
-        others: Launches whose tensors the memory holds, too.
     """
     every = [*(one for made in launches.values() for one in made), *others]
     memory = _Memory([*(tensor for one in every for tensor in one.tensors), *tensors.values()])
@@ -136,7 +133,6 @@ class _Memory:
         self._places = [self.add(ctypes.string_at(first, last - first)) for first, last in parts]
 
     def add(self, values: bytes) -> int:
-        """Append some bytes; returns their place."""
         self.content.extend(bytes(-len(self.content) % _SIDE))
         place = START + len(self.content)
         self.content.extend(values)
@@ -149,7 +145,6 @@ class _Memory:
 
 
 def _moved(noted: cpu.Noted, memory: _Memory) -> bytes:
-    """Arguments with the new places of their tensors; WebAssembly reads the lower half of an address."""
     made = type(noted.arguments)(*noted.arguments)
     for k, kind in enumerate(noted.kinds.values(), 3):
         if kind[0] == "*":
@@ -165,7 +160,6 @@ _DEFINED_ELSEWHERE, _OWN_NAME = 0x10, 0x40
 
 
 def _with_exports(code: bytes, names: tuple[str, ...]) -> bytes:
-    """An object file as a module that exports some of its functions."""
     sections = list(_sections(code, 8))
     linking = next(content for kind, content in sections if kind == _CUSTOM and content.startswith(b"\x07linking"))
     numbers = dict(_functions(linking))
@@ -186,7 +180,6 @@ def _sections(code: bytes, at: int) -> Iterator[tuple[int, bytes]]:
 
 
 def _functions(linking: bytes) -> Iterator[tuple[str, int]]:
-    """Names and numbers of the functions of the section ``linking``."""
     symbols = next(content for kind, content in _sections(linking, 9) if kind == _SYMBOLS)
     count, at = _read(symbols, 0)
     for _ in range(count):

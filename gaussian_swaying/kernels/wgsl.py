@@ -41,7 +41,6 @@ def shaders(
 
     Args:
         passes: Noted launches by the names of the passes; of blocks with one lane.
-        place: The byte of an address in the buffer.
 
     Raises:
         TranslationError: If a kernel uses something that shaders do not have.
@@ -70,7 +69,6 @@ class _Shader(Translator):
         self._count = 0
 
     def written(self, noted: Noted) -> str:
-        """The body of the shader of a launch."""
         if noted.real != "f32":
             raise TranslationError(f"{noted.kernel.__name__} computes in double precision")
         x, y, _, *words = noted.arguments
@@ -97,13 +95,11 @@ class _Shader(Translator):
         return f"t{self._count}"
 
     def _made_of(self, kind: str, shape: Shape, texts: Sequence[str]) -> Block:
-        """A block of new names for some expressions."""
         names = tuple(self._name() for _ in texts)
         self._lines += [f"let {name} = {text};" for name, text in zip(names, texts, strict=True)]
         return Block(names, kind, shape)
 
     def _variables(self, kind: Any) -> list[str]:
-        """New variables for the numbers of a type."""
         texts: list[str] = []
         if isinstance(kind, tuple):
             for part in kind:
@@ -191,7 +187,6 @@ class _Shader(Translator):
     # ---- numbers
 
     def constant(self, number: complex, kind: str, shape: Shape = ()) -> Block:
-        """See ``Emitter``."""
         plain: Any = number
         if kind == "i1":
             text = "true" if number else "false"
@@ -204,7 +199,6 @@ class _Shader(Translator):
         return Block((text,) * math.prod(shape), kind, shape)
 
     def convert(self, block: Block, kind: str) -> Block:
-        """See ``Emitter``."""
         if block.kind == kind:
             return block
         old, new = _TYPES[block.kind], _TYPES[kind]
@@ -213,7 +207,6 @@ class _Shader(Translator):
         return self._made_of(kind, block.shape, [f"{new}({x})" for x in block.value])
 
     def splat(self, block: Block, shape: Shape) -> Block:
-        """See ``Emitter``."""
         lanes = math.prod(shape)
         if block.lanes not in (1, lanes):
             raise TranslationError(f"blocks of the shapes {block.shape} and {shape} do not fit")
@@ -223,12 +216,10 @@ class _Shader(Translator):
         return self._made_of(kind, blocks[0].shape, [write(*x) for x in zip(*(b.value for b in blocks), strict=True)])
 
     def unary(self, name: str, x: Value) -> Block:
-        """See ``Emitter``."""
         block = self.convert(self.block(x), "f32")
         return self._by_lanes("f32", lambda a: f"{_FUNCTIONS.get(name, name)}({a})", block)
 
     def arithmetic(self, sign: str, x: Value, y: Value) -> Value:
-        """See ``Emitter``."""
         if isinstance(x, Pointer) or isinstance(y, Pointer):
             return super().arithmetic(sign, x, y)
         a, b = self.matched(x, y)
@@ -241,24 +232,19 @@ class _Shader(Translator):
         return self._by_lanes(a.kind, lambda p, q: f"({p} {shown} {second.format(q)})", a, b)
 
     def rounded(self, sign: str, x: Value, y: Value) -> Block:
-        """See ``Emitter``."""
         found: Block = self.arithmetic(sign, x, y)
         return found
 
     def negative(self, x: Block) -> Block:
-        """See ``Emitter``."""
         return self._by_lanes(x.kind, lambda a: f"-({a})", x)
 
     def bits(self, x: Block, kind: str) -> Block:
-        """See ``Emitter``."""
         return self._by_lanes(kind, lambda a: f"bitcast<{_TYPES[kind]}>({a})", x)
 
     def compare(self, sign: str, x: Value, y: Value) -> Block:
-        """See ``Emitter``."""
         return self._by_lanes("i1", lambda p, q: f"({p} {sign} {q})", *self.matched(x, y))
 
     def where(self, condition: Value, x: Value, y: Value) -> Value:
-        """See ``Emitter``."""
         chosen = self.convert(self.block(condition), "i1")
         a, b = self.matched(x, y)
         shape = self.common_shape(chosen.shape, a.shape)
@@ -266,7 +252,7 @@ class _Shader(Translator):
         return self._by_lanes(a.kind, lambda c, p, q: f"select({q}, {p}, {c})", chosen, a, b)
 
     def extreme(self, which: str, x: Value, y: Value, nan: bool = False) -> Block:
-        """See ``Emitter``; what it gives for NaN is not known."""
+        """What it gives for NaN is not known."""
         a, b = self.matched(x, y)
         return self._by_lanes(a.kind, lambda p, q: f"{which}({p}, {q})", a, b)
 
@@ -274,11 +260,9 @@ class _Shader(Translator):
         return self.unary("exp", x) if name == "exp" else elementary.log(self, self.block(x))
 
     def arange(self, start: int, end: int) -> Block:
-        """See ``Emitter``."""
         return Block(tuple(f"{k}i" for k in range(start, end)), "i32", (end - start,))
 
     def reduce(self, which: str, x: Block, axis: int | None = None) -> Block:
-        """See ``Emitter``."""
         if x.kind == "i1":
             x = self.convert(x, "i32")
         shape = () if axis is None else x.shape[:axis] + x.shape[axis + 1 :]
@@ -296,7 +280,6 @@ class _Shader(Translator):
     # ---- memory
 
     def load(self, pointer: Pointer, mask: Value = None, other: Value = None) -> Block:
-        """See ``Emitter``."""
         kind = pointer.kind
         mask, shape = self._where(pointer, mask)
         offset = self.splat(pointer.offset, shape)
@@ -316,7 +299,6 @@ class _Shader(Translator):
         return self.convert(found, "i1") if kind == "i1" else found
 
     def store(self, pointer: Pointer, value: Value, mask: Value = None) -> None:
-        """See ``Emitter``."""
         if pointer.kind not in ("i32", "f32"):
             raise TranslationError(f"numbers of the type {pointer.kind} cannot be stored")
         block = self.convert(self.block(value), pointer.kind)
@@ -328,7 +310,7 @@ class _Shader(Translator):
             self._lines.append(text if real == "true" else f"if ({real}) {{ {text} }}")
 
     def atomic(self, operation: str, pointer: Pointer, value: Value, mask: Value = None) -> Block:
-        """See ``Emitter``; only the largest of positive numbers, which are in the order of their bits."""
+        """Only the largest of positive numbers, which are in the order of their bits."""
         block = self.block(value)
         if operation != "max" or pointer.kind != "f32" or mask is not None or block.lanes != 1:
             raise TranslationError("shaders only find the largest number")

@@ -99,7 +99,7 @@ class Boundary(Component, nn.Module, ABC):
 
     @property
     def window(self) -> list[float]:
-        """The times between which it acts [s]."""
+        """Start and end of its action [s]."""
         return [self.start, self.end]
 
     def in_frame(self, frame: SimFrame) -> Boundary:
@@ -107,12 +107,12 @@ class Boundary(Component, nn.Module, ABC):
         return self
 
     def copy_in(self: _Kind, frame: SimFrame, **tensors: Tensor) -> _Kind:
-        """A copy with its ``region``, if it has one, evaluated in metres, and with some tensors replaced."""
+        """A copy with its ``region`` evaluated in metres and with some tensors replaced."""
         held = vars(self).get("region")
         return changed(self, **tensors, **({} if held is None else {"region": RegionInFrame(held, frame)}))
 
     def hold_kind(self, neighbours_fixed: bool) -> str:
-        """Return what it acts on: ``nodes`` (:meth:`forward`), points as a ``hinge`` or ``clamp``, or the ``surface``.
+        """What it acts on: ``nodes`` (:meth:`forward`), points as a ``hinge`` or ``clamp``, or the ``surface``.
 
         It may also be :data:`BY_BODY`, which leaves the choice of hinge or clamp to the formulation.
 
@@ -140,7 +140,7 @@ class Boundary(Component, nn.Module, ABC):
         return type(self).target is not Boundary.target
 
     def target(self, place: Tensor, time: Tensor, dt: float | Tensor) -> Tensor:
-        """Velocity of what it holds at some places now (..., 3) [m/s], for a substep of ``dt`` [s]; zero if at rest."""
+        """Target velocity of held material at places (..., 3) [m/s], for a substep of ``dt`` [s]."""
         return torch.zeros_like(place)
 
     def particle_mask(self, rest_position: Tensor) -> Tensor | None:
@@ -167,14 +167,13 @@ class Boundary(Component, nn.Module, ABC):
 
 
 class ParticleBoundary(Boundary):
-    """Base class of the conditions that act on the particles of a region, wherever they go."""
+    """Base class of conditions on the particles that lie in a region at rest."""
 
     def __init__(self, region: Region, start: float = 0.0, end: float | None = None) -> None:
         super().__init__(start, end)
         self.region = region
 
     def in_frame(self, frame: SimFrame) -> Boundary:
-        """The condition with its region evaluated in metres."""
         return self.copy_in(frame)
 
     def particle_mask(self, rest_position: Tensor) -> Tensor:

@@ -36,7 +36,7 @@ POSE = tl.constexpr(32)
 
 @triton.jit
 def touch(x, numbers, rows, step, mask, SOLIDS: tl.constexpr, w: tl.constexpr):
-    """Distance from solid w less its gap, its normal, and its velocity at places x."""
+    """Distance to solid w less its gap, its normal, and its velocity, at places x."""
     MOVES: tl.constexpr = SOLIDS.per_substep[w][1] > 0
     own_numbers = numbers + SOLIDS.numbers[w][0]
     pose = own_numbers + 2
@@ -88,7 +88,7 @@ def stop_nodes(
 
 @triton.jit
 def acts(window, now):
-    """True if a solid acts at a time, from its first and last time."""
+    """True if a solid acts at a time, given its start and end."""
     now = now + 1e-9  # boundary.CLOCK
     return (now >= tl.load(window)) & (now < tl.load(window + 1))
 
@@ -111,7 +111,7 @@ def plane_velocity(velocity: Tensor, normal: Tensor, kind: str, friction: float)
 
 
 class Wall(Boundary):
-    """What particles cannot enter or leave: a half space, or a box that keeps them inside, by conditions on nodes.
+    """A half space that particles cannot enter, or a box that they cannot leave; it acts on grid nodes.
 
     Args:
         shape: A ``HalfSpace`` that they cannot enter, or a ``Box`` that they cannot leave, in scene units; a null in
@@ -155,7 +155,7 @@ class Wall(Boundary):
 
     @property
     def sides(self) -> Sequence[Wall]:
-        """The planes of a box, or itself."""
+        """Its planes: those of a box, or itself."""
         return list(self.planes) or [self]  # type: ignore[arg-type]
 
     def in_frame(self, frame: SimFrame) -> Wall:
@@ -176,7 +176,7 @@ class Wall(Boundary):
         return torch.where((behind & self.active(nodes.time))[..., None], stopped, velocity)
 
     def device_function(self) -> DeviceFunction:
-        """That of the half space; of a box nothing but that of each plane."""
+        """The device function of a half space; a box has one for each plane."""
         if self.planes:
             return DeviceFunction(None, parts=tuple(plane.device_function() for plane in self.planes))  # type: ignore[operator]
         solid = DeviceFunction(half_space_distance, numbers=Numbers(3, lambda: self.normal), sources=(self,))
@@ -262,7 +262,6 @@ class Obstacle(Boundary):
         self.table: Tensor
 
     def _solid(self, frame: SimFrame | None) -> dict[str, Tensor]:
-        """The numbers and the table of its distance in scene units, or in the metres of a frame."""
         axes = rotation_of(torch.deg2rad(torch.tensor(self.rotation, dtype=torch.float64)))
         unit, axes = (1.0, axes) if frame is None else (frame.metres_per_unit, frame.rotation @ axes)
         numbers, table = self.shape.solid(unit, axes)
@@ -286,7 +285,7 @@ class Obstacle(Boundary):
         return "surface" if neighbours_fixed else "nodes"
 
     def device_function(self) -> DeviceFunction | None:
-        """That of its shape, with what :func:`touch` reads."""
+        """The distance function of its shape, with the numbers that :func:`touch` reads."""
         if not len(self.numbers):
             return None
         numbers = Numbers(len(self.numbers), lambda: self.numbers)
@@ -327,7 +326,7 @@ class Obstacle(Boundary):
         return self.path is None
 
     def fastest(self, farthest: float, start: float = -math.inf, end: float = math.inf) -> float:
-        """Bound of its speed [m/s] at places up to ``farthest`` [m] from its centre, between two times [s]."""
+        """Upper bound of its speed [m/s] within ``farthest`` [m] of its centre, between two times [s]."""
         start, end = max(start, self.start), min(end, self.end)
         if not start < end:
             return 0.0
@@ -335,7 +334,7 @@ class Obstacle(Boundary):
         return shifts + (turns * farthest if turns else 0.0)
 
     def motion(self, time: Tensor, dt: float | Tensor) -> tuple[Tensor, ...]:
-        """Its centre [m] (..., 3) and rotation (..., 3, 3) at times [s], and the velocity of what is at an offset.
+        """Its centre [m] (..., 3), rotation (..., 3, 3) and velocity field at times [s].
 
         The velocity [m/s] is a matrix (..., 3, 3) times the offset, and that of the centre (..., 3). It takes each
         place of the obstacle to where it is ``dt`` later.
@@ -369,8 +368,6 @@ class Obstacle(Boundary):
 
 
 def _placed(solid: DeviceFunction, gap: float, friction: float, centre: Tensor) -> DeviceFunction:
-    """The device function of a solid whose numbers begin with gap, friction and place of its centre."""
-
     def numbers() -> Tensor:
         shape = torch.as_tensor(own.take()).to(centre)
         return torch.cat([centre.new_tensor([gap, friction]), centre, shape.reshape(-1)])
@@ -383,12 +380,7 @@ Solid = Wall | Obstacle
 
 
 def solids_of(boundaries: Sequence[Boundary], pins: Container[int] = ()) -> list[tuple[Solid, int]] | None:
-    """All solids, each with the number of its boundary; None if a boundary has no device function.
-
-    Args:
-        boundaries: The boundary conditions of a body.
-        pins: Numbers of those that are no solids.
-    """
+    """All solids with the indices of their boundaries; None if a boundary has no device function."""
     others = [(one, k) for k, one in enumerate(boundaries) if k not in pins]
     if any(boundary.device_function() is None for boundary, _ in others):
         return None

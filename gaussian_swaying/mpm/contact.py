@@ -133,11 +133,9 @@ class Surface:
         """The material points as a surface.
 
         Args:
-            points: The material.
             normal: Normals of the sheet at its points, shape (P, 3); needed for contact with itself.
             spacing: Distance of neighbouring points [m]; discs reach 0.75 of it.
             thickness: Distance that two surfaces keep [m], unless ``contact`` has one.
-            contact: Contact of the surface with itself.
         """
         place = points.position.detach().reshape(-1, 3)
         if contact is not None and (normal is None or spacing <= 0 or points.position.dim() > 2):
@@ -205,7 +203,6 @@ class ContactStage:
             self.apart = max(APART * self.dx, 3 * thickest)
 
     def _nodes(self, first: Tensor, point_first: Tensor, point_node: Tensor) -> Tensor:
-        """The nodes of the samples, with virtual ones: those of the material point that each belongs to."""
         near, many = self.surface.near, len(point_first) // self.scenes
         if near is None:
             raise ValueError("Contact of a body with `attached` parts needs `near` in its Surface.")
@@ -332,7 +329,6 @@ class ContactRun:
         return torch.zeros(shape, dtype=dtype or self.fields.dtype, device=self.device)
 
     def _programs(self) -> int:
-        """Programs that meet: one in the interpreter, which runs them one after the other."""
         if INTERPRETED or self.device.type != "cuda":
             return 1
         room = PER_PROCESSOR * torch.cuda.get_device_properties(self.device).multi_processor_count
@@ -340,7 +336,7 @@ class ContactRun:
         return max(1, min(room, needed, int(kernels.MOST_PROGRAMS.value)))
 
     def take_room(self, room: int, slots: int) -> None:
-        """Make the buffers whose size depends on how crowded the surface is; if they are refused, the old ones stay."""
+        """Allocate the buffers whose size depends on crowding; if that fails, keep the old ones."""
         places, planes = self.places, int(kernels.PLANES.value)
         for needed in (kernels.NEEDED_ROOM, kernels.NEEDED_SLOTS):
             self.status[int(needed.value)] = 0  # what a refused rollout needed says nothing about the next one
@@ -373,7 +369,7 @@ class ContactRun:
         return int(self.status[int(kernels.ROUNDS.value)])
 
     def fits(self) -> bool:
-        """True if lists were complete and buffers large enough since :meth:`take`; if not, they will. The host waits.
+        """True if lists were complete and buffers large enough since :meth:`take`; if not, enlarge them (host waits).
 
         Lists are made for the motion of the substeps before, and a bit more.
         """
@@ -391,12 +387,11 @@ class ContactRun:
         return False
 
     def due(self, steps: int) -> range:
-        """The substeps of a rollout before which lists are made."""
         self.used = min(steps, self.interval)
         return range(0, steps if self.stage.contact is not None and self.places else 0, self.interval)
 
     def make_lists(self, _: int = 1) -> None:
-        """List the samples that may touch before a node moves by half the margin; can be recorded."""
+        """List candidate pairs, valid until a node moves by half the margin; recordable."""
         stage, places, block = self.stage, self.places, lanes(self.device, BLOCK, 1)
         self._read()
         self.low.copy_(self.position.amin(0))
@@ -418,7 +413,6 @@ class ContactRun:
         )  # fmt: skip
 
     def _read(self) -> None:
-        """Read the positions and velocities of all contact samples from the nodes."""
         stage, block = self.stage, lanes(self.device, BLOCK, 1)
         _, ny, nz = stage.grid.resolution
         launch(kernels.contact_positions, (-(-self.places // block),))(
@@ -432,7 +426,6 @@ class ContactRun:
         Args:
             time: Time at its start [s], scalar float64 tensor.
             dt: Substep [s], scalar float64 tensor.
-            steps: Number of substeps.
         """
         self.motion.zero_()
         for solid in self.solids:
@@ -450,9 +443,6 @@ class ContactRun:
         """Change the velocities of the nodes by the impulses of a substep; can be recorded.
 
         Args:
-            schedule: Times of the substeps.
-            first_step: Number of the first substep.
-            offset: Number of this one after it.
             time: Time now [s], scalar float64 tensor.
             dt: Substep [s], scalar float64 tensor.
         """
@@ -511,7 +501,6 @@ def _carries(node: Tensor, weight: Tensor, nodes: int) -> Tensor:
     Args:
         node: Nodes of each sample, shape (C, 27).
         weight: Their weights, shape (C, 27).
-        nodes: Number of all nodes.
 
     Returns:
         Shape (nodes,).

@@ -175,7 +175,7 @@ COLUMNS = tl.constexpr(1024)
 
 @triton.jit
 def cell_of(x, low, inverse):
-    """Cells of places along an axis, from 1 on; where there is no number, the last one."""
+    """Cell numbers of places along an axis, from 1 on; NaN goes to the last one."""
     t = (x - low) * inverse
     return tl.where(t < COLUMNS - 3, t, COLUMNS - 3).to(tl.int32) + 1
 
@@ -196,7 +196,7 @@ def hashed(cx, cy, last):
 def contact_cells(
     fields, active, active_nodes, before, position, low, limit, cells, hashes, places, last, BLOCK: tl.constexpr
 ):
-    """Write the places of samples with their columns, what they are sorted by, and where the nodes are now."""
+    """Write places with their hashed columns, sort keys, and the current node positions."""
     p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = p < active_nodes
     at = fields + tl.load(active + p, mask, 0) * 8
@@ -218,11 +218,11 @@ def contact_lists(
     position, rest, base, corner, low, limit, start, order, ordered, candidates, near, many, impulse, status, places,
     room, apart, beside, last, VIRTUAL: tl.constexpr, BLOCK: tl.constexpr, WIDE: tl.constexpr,
 ):  # fmt: skip
-    """List the samples closer than ``limit`` to each that were at least ``apart`` from it at rest, and count them.
+    """For each sample, list those closer than ``limit`` now and farther than ``apart`` at rest.
 
     ``start`` is where the samples of a cell begin in their ``order``, in a table of hashed columns of cells: the three
-    cells of a column around a sample follow each other. Another column may have the same entry. With VIRTUAL also
-    those that were at least ``beside`` from it, and have another copy of a node that both reach. Nothing acts on them.
+    cells of a column around a sample follow each other. Another column may have the same entry. With VIRTUAL also those
+    that were at least ``beside`` from it, and have another copy of a node that both reach. Nothing acts on them.
     """
     wide = tl.arange(0, WIDE)[None, :]
     p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -350,7 +350,6 @@ def _keep(data, other, slots, places, p, many, acts, q, n0, n1, n2, target):
 
 @triton.jit
 def _target(gap, push, most, dt):
-    """The least velocity along the normal after the substep."""
     return tl.where(gap > 0, -gap, tl.minimum(-gap * push, most)) / dt
 
 

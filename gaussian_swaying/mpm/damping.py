@@ -17,7 +17,6 @@ def decay_rate(ratio: float, frequency: float) -> float:
     mass part), so one of twice the frequency has half of it.
 
     Args:
-        ratio: :math:`\zeta`, share of critical damping.
         frequency: f [Hz].
     """
     return 4 * math.pi * frequency * ratio
@@ -46,10 +45,7 @@ def kelvin_voigt_pk1(F: Tensor, F_rate: Tensor, mu: Tensor, lam: Tensor, time: f
     stiffness part).
 
     Args:
-        F: Deformation gradient, shape (..., 3, 3).
         F_rate: Its rate [1/s], shape (..., 3, 3).
-        mu: Shear modulus [Pa], shape (...).
-        lam: First Lamé parameter [Pa], shape (...).
         time: :math:`\beta` [s].
 
     Returns:

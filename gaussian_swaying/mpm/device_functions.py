@@ -29,7 +29,7 @@ from gaussian_swaying.kernels.graphs import recorded_key, tensors_in
 
 @dataclass(frozen=True)
 class Numbers:
-    """The number of numbers, and a function that returns them as a tensor or a sequence."""
+    """Parameter count and getter; the getter returns a tensor or a sequence."""
 
     count: int
     take: Callable[..., Any]
@@ -102,7 +102,7 @@ class Composed(Constant):
 
     Attributes:
         options: The options of each, and its parts.
-        per_point: First and number of the numbers of a point, for each device function; the others likewise.
+        per_point: (offset, count) of the per-point numbers of each device function; the others likewise.
         numbers: Those of all points.
         per_substep: Those of a substep.
         tables: Where the table of each starts: that of its parts (``size`` entries), and then its own.
@@ -129,7 +129,6 @@ class Composed(Constant):
 
 
 def _places(counts: Any) -> tuple[tuple[int, int], ...]:
-    """First and number of some groups of numbers, one after the other."""
     found, first = [], 0
     for count in counts:
         found.append((first, count))
@@ -138,7 +137,7 @@ def _places(counts: Any) -> tuple[tuple[int, int], ...]:
 
 
 def end_of(places: Sequence[tuple[int, int]]) -> int:
-    """The end of the last of some groups of numbers."""
+    """Total count of groups of numbers."""
     return sum(places[-1]) if places else 0
 
 
@@ -150,7 +149,6 @@ def device_key(function: Any) -> str:
 def _pieces(
     given: Sequence[DeviceFunction], layout: Composed, start: int, numbers: bool
 ) -> Iterator[tuple[DeviceFunction, list[tuple[int, Numbers]]]]:
-    """Yield each device function and its parts with the places of its numbers and of its table in a buffer."""
     for one, part, (first, _), table in zip(given, layout.parts, layout.numbers, layout.tables, strict=True):
         yield from _pieces(one.parts, part, start + table, True)
         yield (one, [(start + first, one.numbers if numbers else NONE), (start + table + part.size, one.table)])
@@ -177,11 +175,11 @@ class Packed:
         self._seen: dict[int, tuple[object, object]] = {}
 
     def take(self, given: Sequence[DeviceFunction], steps: int) -> Tensor | None:
-        """Bring the buffers up to date; what one device function has is written only if its sources have changed.
+        """Bring the buffers up to date, rewriting only what changed since the last call.
 
         Returns:
-            The numbers of the points, shape (N, n); None if all is as it was. It never is for tensors of inference
-            mode, whose changes cannot be detected.
+            The per-point numbers, shape (N, n); None if they have not changed. Changes of inference-mode tensors cannot
+                be detected, so these always count as changed.
         """
         layout, changed = self.layout if given is self.given else Composed(given), False
         if layout != self.layout:

@@ -82,7 +82,6 @@ class LawDispatch:
         return wave, bound
 
     def return_map(self, F: Tensor, internal: Tensor | None, dt: float) -> tuple[Tensor, Tensor | None]:
-        """Elastic deformation gradient and internal variable after plastic flow."""
         internal = self.initial_internal() if internal is None else internal
         found = self._each("return_map", F, internal, dt)
         return found[0], found[1] if internal is not None else None
@@ -106,7 +105,6 @@ class LawDispatch:
 
 
 def _as_tuple(found: Tensor | tuple[Tensor, Tensor | None], internal: Tensor | None) -> tuple[Tensor, ...]:
-    """The results of a law; if it has no internal variable, the given one is returned unchanged."""
     if isinstance(found, Tensor):
         return (found,)
     first, second = found
@@ -166,7 +164,7 @@ def _once(functions: Any) -> tuple[Any, ...]:
 
 
 def in_common(laws: Sequence[ConstitutiveLaw], name: str) -> Any:
-    """``(F, mu, lam)``: the ``wave`` or ``energy`` density that all laws share.
+    """The ``wave`` or ``energy`` density ``(F, mu, lam)`` shared by all laws.
 
     None if they do not, or if it needs numbers of a law or an internal variable.
     """
@@ -191,7 +189,6 @@ def _numbers(row):
 
 @triton.jit
 def _principal(a, mu, lam, internal, which, p, LAWS: tl.constexpr):
-    """Principal first Piola-Kirchhoff stresses; arbitrary for a law with another kind of stress."""
     y = LAWS.principals[0](a, mu, lam, internal, p)
     for k in tl.static_range(1, len(LAWS.principals)):
         y = where3(which == k, LAWS.principals[k](a, mu, lam, internal, p), y)
@@ -234,7 +231,6 @@ def pk1_adjoint(F, Q, mu, lam, row, ADJOINTS: tl.constexpr):
 
 @triton.jit
 def _flow(a, mu, lam, internal, which, p, dt, LAWS: tl.constexpr):
-    """Principal stretches and internal variable after plastic flow."""
     new, inner = LAWS.flows[0](a, mu, lam, internal, p, dt)
     if not LAWS.all_flow:
         new = where3(which == 0, new, a)

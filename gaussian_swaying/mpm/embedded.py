@@ -53,7 +53,7 @@ def follow(
 
 
 class EmbeddedPoints(nn.Module, ABC):
-    """Places in the material whose motion is interpolated from a state.
+    """Points embedded in the material: their motion is interpolated from a state.
 
     Args:
         arm: From the place that is read to the place that follows, at rest [m], shape (M, 3); it turns and stretches
@@ -87,12 +87,12 @@ class EmbeddedPoints(nn.Module, ABC):
         return embedded_stencil(self.places, grid, self.table(grid))
 
     def table(self, grid: GridSpec) -> Tensor | None:
-        """Nodes of the places, shape (27, M), if the grid has virtual ones."""
+        """Nodes of the points, shape (27, M), if the grid has virtual ones."""
         return None
 
     @abstractmethod
     def some(self, index: Tensor) -> EmbeddedPoints:
-        """Some of them, by their numbers (K,)."""
+        """A subset, by indices (K,)."""
 
     def nodes(self, state: Any) -> Tensor | None:
         """The nodes that the stencils of the places reach: flat indices in rising order, shape (N,).
@@ -111,7 +111,7 @@ class EmbeddedPoints(nn.Module, ABC):
         return None if nodes is None else _nodal(state.node_displacement)[nodes]
 
     def layout(self, state: Any) -> object:
-        """The key of a recording of :meth:`motion`, besides the fields that it reads."""
+        """Key of a recording of :meth:`motion`, besides the fields that it reads."""
         return None
 
     def drawn(
@@ -141,7 +141,7 @@ class EmbeddedPoints(nn.Module, ABC):
 
 
 class EmbeddedAtPoints(EmbeddedPoints):
-    """EmbeddedPoints of material points.
+    """Embedded points that follow material points.
 
     Args:
         source: The point that each follows, shape (M,).
@@ -182,7 +182,7 @@ class EmbeddedAtPoints(EmbeddedPoints):
 
 
 class EmbeddedInGrid(EmbeddedPoints):
-    """EmbeddedPoints of the nodal fields of the ``total`` formulation, each with its own stencil.
+    """Embedded points that read the nodal fields of ``total``, each with its own stencil.
 
     Args:
         place: Rest positions that are read [m], shape (M, 3).
@@ -271,7 +271,7 @@ class EmbeddedInGrid(EmbeddedPoints):
 
 
 def embedded_stencil(place: Tensor, grid: GridSpec, nodes: Tensor | None = None) -> Stencil:
-    """The stencil of embedded (M, 3) [m], as that of the material in ``total``."""
+    """The interpolation stencil of embedded points at places (M, 3) [m]."""
     return bspline_stencil(place, grid, moments=False, snap=torch.finfo(place.dtype).eps ** 0.5, nodes=nodes)
 
 
@@ -285,14 +285,13 @@ def _nodal(field: Tensor | None) -> Tensor:
 
 @torch.no_grad()
 def on_material(place: Tensor, nearest: Tensor, points: MaterialPoints, dx: float) -> tuple[Tensor, Tensor | None]:
-    """Places that can be read: their own if all their nodes have mass, otherwise those of a material point.
+    """Readable places: the given ones if all their nodes have mass, otherwise a nearby material point.
 
     A group's nodes are those of all its members, except where the centre of mass lies on the border of its cell.
 
     Args:
         place: Rest positions [m], shape (M, 3), float64.
         nearest: A material point close to each, shape (M,); with ``attached`` parts, one of the part that it follows.
-        dx: Grid spacing [m].
 
     Returns:
         The places, shape (M, 3), and the nodes of each, shape (27, M), or None if they are those of the lattice.

@@ -148,7 +148,7 @@ class Formulation(ABC):
         return found
 
     def restiffened(self, points: MaterialPoints) -> Formulation | None:
-        """The same body with points of another stiffness; None if it must be bound anew."""
+        """The same body with another stiffness; None if it must be bound anew."""
         return None
 
     def tensors(self) -> list[Tensor]:
@@ -293,7 +293,7 @@ class Formulation(ABC):
         return velocity, torch.stack(taken, dim=-2) if taken else self.no_impulse()
 
     def in_shape(self, state: MPMState) -> MPMState:
-        """The state with the particles of rigid parts exactly where these are, without round-off; itself if none is."""
+        """The state with rigid parts exactly in shape, free of round-off."""
         return state
 
     # ---- measures of a state
@@ -317,7 +317,7 @@ class Formulation(ABC):
     # ---- how long a substep may be
 
     def frame_steps(self, seconds: float) -> int | None:
-        """Substeps in some seconds, for a formulation that is stable with any; None to follow the fastest wave."""
+        """Substeps for a time if any substep is stable; None to follow the fastest wave."""
         return None
 
     def stable_substep(self, state: MPMState | None) -> float:
@@ -344,7 +344,7 @@ class Formulation(ABC):
         return self.with_bending(cfl_number(1.0, self.settings.dx, speed, state.velocity if spatial else None).detach())
 
     def with_bending(self, cells: _Number) -> _Number:
-        r"""Cells per second of a wave that is as hard to resolve as some waves and the bending of sheets together.
+        r"""Courant rate that includes the bending of sheets.
 
         The largest circular frequency of elastic waves is at most :math:`\sqrt 6` times their cells per second
         (:mod:`~gaussian_swaying.mpm.timestep`), and squares of frequencies add up.
@@ -352,7 +352,7 @@ class Formulation(ABC):
         return (cells**2 + self.bending_rate / 6) ** 0.5 if self.bending_rate > 0 else cells
 
     def obstacle_cells(self, state: MPMState, seconds: float) -> float:
-        """Return the cells per second of the fastest obstacle that acts on nodes, in some seconds from a state on.
+        """Largest number of cells per second that an obstacle on nodes crosses, within some seconds of a state.
 
         Such an obstacle stops the nodes that it meets, and would jump over those between two substeps. The host waits
         if there is one that moves.
@@ -368,7 +368,7 @@ class Formulation(ABC):
         return max(speeds) / self.settings.dx
 
     def viscous_time(self, state: MPMState | None) -> float:
-        """The stiffness damping [s], times the factor by which stretch stiffens the viscous stress."""
+        """Stiffness damping [s] times the stiffening of the viscous stress by stretch."""
         time = self.settings.stiffness_damping
         if time == 0 or state is None:
             return time

@@ -137,7 +137,6 @@ class Joints(Force):
 
     @staticmethod
     def _mean(field: Tensor, mass: Tensor, whole: Tensor, of: Tensor) -> Tensor:
-        """The mean of a field (E, ...) over the points of each set, weighted with their masses."""
         shape = (-1, *[1] * (field.dim() - 1))
         found = field.new_zeros(len(whole), *field.shape[1:]).index_add(0, of, mass.view(shape) * field)
         return found / whole.view(shape)

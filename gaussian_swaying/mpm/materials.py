@@ -50,7 +50,6 @@ class KnownMaterial:
 
     @property
     def numbers(self) -> dict[str, float]:
-        """The fields of a ``Material``: E, nu, density and thickness."""
         return {name: getattr(self, name) for name in ("E", "nu", "density", "thickness")}
 
 

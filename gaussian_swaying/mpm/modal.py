@@ -141,7 +141,6 @@ class Structure:
         return self.with_rows(self.hooke())
 
     def with_rows(self, K: Any) -> Any:
-        """A stiffness with pinned points and ties as stiff rows."""
         self.stiff = STIFF_ROW * float(abs(K.diagonal()).max())
         for _, row, _ in self.pins:
             K = K + self.stiff * (row.T @ row)
@@ -150,7 +149,7 @@ class Structure:
         return K.tocsr()
 
     def reduced(self, K: Any) -> tuple[Any, Any]:
-        """Stiffness and mass of the degrees of freedom, by a stiffness of the nodes."""
+        """Stiffness and mass in the degrees of freedom, from a nodal stiffness."""
         import scipy.sparse as sparse
 
         S = self.spread
@@ -230,7 +229,6 @@ class Structure:
         return pinned, rows
 
     def _tie(self) -> list[Any]:
-        """Rows that make a piece which nothing holds follow the nearest point that is held, as if glued to it."""
         import scipy.sparse as sparse
         from scipy.sparse.csgraph import connected_components
         from scipy.spatial import cKDTree
@@ -263,7 +261,6 @@ class Structure:
         return rows
 
     def _degrees(self) -> Any:
-        """The degrees of freedom: nodes with mass that nothing holds, and six of each rigid part."""
         import scipy.sparse as sparse
 
         free = (self.pinned < 0) & (self.mass > 1e-7 * self.mass.max())
@@ -345,7 +342,6 @@ class Structure:
         return self._result(square[chosen], S @ modes[:, chosen], float(first), second, int(loose.sum()))
 
     def _first_guess(self) -> float:
-        """A shift that is too large: the square of the frequency of a wave along the body."""
         side = float(np.ptp(self.rest, axis=0).max())
         return max(self.volume.sum() / max(side, 1e-30) ** 2, 1e-300)
 
@@ -429,7 +425,7 @@ def _power_of_two(value: float) -> float:
 
 
 def rayleigh(K: Any, M: Any, shapes: np.ndarray) -> float:
-    """Rayleigh's quotient of the leans along x and y (n, 2): the lower one."""
+    """The smaller Rayleigh quotient of leans along x and y, (n, 2)."""
     return float(((shapes * (K @ shapes)).sum(0) / (shapes * (M @ shapes)).sum(0)).min())
 
 
@@ -475,7 +471,6 @@ def analysis_of(total: Total, scene: int, most: int, guess: float | None = None)
 
 
 def _content(total: Total, scene: int, most: int) -> str:
-    """A hash of what the modes depend on, but for :func:`_numbers`."""
     points, digest = total.points, hashlib.sha256()
     count = points.count
 

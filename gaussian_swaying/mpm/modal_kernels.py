@@ -26,7 +26,7 @@ def oscillation(square, alpha, dt):
 
 @triton.jit
 def factors(square, alpha, dt):
-    """What a substep makes of an amplitude and its rate, and of its rate by a load: see :func:`amplitude`."""
+    """Coefficients of a substep for amplitude, rate and load, see :func:`amplitude`."""
     decay, sine, cosine = oscillation(square, alpha, dt)
     return decay * (cosine + alpha * sine), decay * sine, decay * (cosine - alpha * sine)
 
@@ -39,7 +39,7 @@ def amplitude(q, p, rest, keep, sine):
 
 @triton.jit
 def warp(turn, shift):
-    r"""A displacement that is turned along its way: :math:`\int_0^1 R(s w)\, ds\; d`, as ``modes.warped``."""
+    r"""A displacement rotated progressively: :math:`\int_0^1 R(s w)\, ds\; d`, as ``modes.warped``."""
     square = dot3(turn, turn)
     small = square < 1e-2
     safe = tl.where(small, 1.0, square)
@@ -116,7 +116,7 @@ def modal_drag(shapes, forces, drag, sites, count, BLOCK: tl.constexpr):
 
 @triton.jit(do_not_specialize=("count",))
 def modal_swing(q, p, load, drag, factor, left, lost, count, BLOCK: tl.constexpr):
-    """Amplitudes and rates after a substep, with the drag at the mean rate of the substep, by minimal residuals."""
+    """Amplitudes and rates after a substep with drag at the mean rate, solved by minimal residuals."""
     whole = 0.0
     for start in range(0, count, BLOCK):
         m = start + tl.arange(0, BLOCK)
@@ -172,7 +172,7 @@ def modal_swing(q, p, load, drag, factor, left, lost, count, BLOCK: tl.constexpr
 
 @triton.jit(do_not_specialize=("sites",))
 def modal_placed(moved, rest, out, sites, BLOCK: tl.constexpr):
-    """Places of sites, as :func:`modal_shown` shows nodes."""
+    """Positions of the sites: rest positions plus the displacement of :func:`modal_shown`."""
     n = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = n < sites
     found = warp(load3(moved, 2, 6 * (sites + n), mask), load3(moved, 2, 6 * n, mask))

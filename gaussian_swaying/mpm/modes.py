@@ -165,7 +165,7 @@ class Modes(Total):
 
     @property
     def inertia(self) -> Tensor:
-        """Generalised masses of the modes, which are one, shape (..., M); with the gradient of the masses."""
+        """Modal masses, all one, shape (..., M); they carry the gradient of the masses."""
         mass = self.points.mass
         one = torch.ones_like(self._square)
         if not torch.is_grad_enabled() or not mass.requires_grad:
@@ -206,7 +206,6 @@ class Modes(Total):
         return values.new_zeros(*values.shape[:-2], self.sites, values.shape[-1]).scatter_add(-2, index, values)
 
     def _grouped(self, force: Force) -> Force | None:
-        """A force on the sites, made once; None if it has to see all points."""
         if force not in self._forces:
             self._forces[force] = force.on_sites(self.site, self.sites)
         return self._forces[force]
@@ -216,7 +215,6 @@ class Modes(Total):
         return self.at_sites(mass * values) / self.site_mass[..., None].clamp(min=torch.finfo(mass.dtype).tiny)
 
     def _kernel(self, state: MPMState, groups: Sequence[Force | None], time: Tensor, dt: float, steps: int) -> Any:
-        """The kernel of the forces on the sites, with their numbers; None where torch computes them."""
         device_functions = [force.device_function() for force in groups if force is not None]
         given = [state.position, *tensors_of([force for force in groups if force is not None]), *self.tensors()]
         if not device_functions or None in device_functions or not replaces((state.position,)):
@@ -231,7 +229,6 @@ class Modes(Total):
         return self._site_forces
 
     def _site_state(self, moved: Tensor, time: Tensor) -> State:
-        """The sites as points that turn without strain, by their displacements and turns and the rates of both."""
         shift, turn = moved.unflatten(-2, (2, -1, 3)).unbind(-4)
         turn = turn[..., 0]
         R = rotation_of(turn)
@@ -243,13 +240,13 @@ class Modes(Total):
     # ---- steps
 
     def first_state(self, velocity: Tensor, margin: int) -> MPMState:
-        """The state at time zero; of a first velocity remains what the modes can show."""
+        """The state at time zero, with the initial velocity projected on the modes."""
         state = super().first_state(velocity, margin)
         p = self._project(self.node_mass[..., None] * state.nodal[1])
         return self.shown(state, torch.zeros_like(p), p)
 
     def shown(self, state: MPMState, q: Tensor, p: Tensor) -> MPMState:
-        """The state with nodes and points where amplitudes and their rates, shape (..., M), place them."""
+        """The state whose nodes and points follow from modal amplitudes and their rates, shape (..., M)."""
         shift = _vectors(self.shape, torch.stack([q, p], -1))
         turn = _vectors(self.turn, q[..., None])[..., 0]
         moved = torch.cat([warped(turn, shift[..., 0]), _turned(rotation_of(turn), shift[..., 1])], -1)
@@ -284,7 +281,6 @@ class Modes(Total):
         forces: Sequence[Force],
         watch: Callable[[int], None] | None = None,
     ) -> MPMState:
-        """Advance by several substeps; see ``MPMSolver.rollout``."""
         q, p = self.amplitudes(state)
         middle = state.time + 0.5 * dt
         groups = [self._grouped(force) for force in forces]
@@ -341,11 +337,7 @@ class Modes(Total):
 
     @torch.no_grad()
     def leaning(self, force: Force, rounds: int = 40) -> MPMState:
-        """The state in which a steady force is in balance with the stiffness, by damped iteration.
-
-        Args:
-            rounds: Iterations, each of which goes half of the way.
-        """
+        """The equilibrium under a steady force, by damped iteration."""
         state = self.first_state(torch.zeros_like(self.points.position), 0)
         q, p = self.amplitudes(state)
         group, square = self._grouped(force), self.square.to(q)
@@ -368,7 +360,6 @@ class Modes(Total):
     def _drag(
         self, resistance: Tensor | None, general: tuple[Tensor, Tensor | None, Tensor] | None, gain: Tensor
     ) -> tuple[Tensor | None, Callable[[Tensor], Tensor]]:
-        """Drag of the modes, (..., M, M), and a function that solves with one plus half of the drag times the gain."""
         drag = None
         if resistance is not None:
             weight = resistance.repeat_interleave(3, -1)[..., None]
@@ -384,7 +375,6 @@ class Modes(Total):
     def _lagging(
         self, state: MPMState, forces: Sequence[Force], groups: Sequence[Force | None]
     ) -> Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor | None, Tensor]] | None:
-        """Loads on the modes, their drag, and loads on the sites, of forces that need all points; None without any."""
         others = [force for force, group in zip(forces, groups, strict=True) if group is None]
         if not others:
             return None
@@ -454,7 +444,7 @@ def _holds_still(boundary: Boundary) -> bool:
 
 
 def warped(turn: Tensor, shift: Tensor) -> Tensor:
-    r"""A displacement that is turned along its way: :math:`\int_0^1 R(s w)\, ds\; d` (Choi & Ko 2005, equation 13).
+    r"""A displacement rotated progressively: :math:`\int_0^1 R(s w)\, ds\; d` (Choi & Ko 2005, equation 13).
 
     Args:
         turn: Rotation w of a place, axis times angle [rad], shape (..., 3).
@@ -496,7 +486,6 @@ class SiteForces:
 
         Args:
             time: Time at which the first one acts [s], scalar float64 tensor.
-            dt: Substep [s].
         """
         values = self.loads.take(forces, steps)
         if values is not None:

@@ -260,7 +260,6 @@ class PinnedRegion(ParticleBoundary):
 
 
 def _refused(boundary: Boundary, what: str, instead: str) -> ValueError:
-    """The error for a boundary that holds points where only nodes can be held."""
     return ValueError(
         f"{what} of the {type(boundary).__name__} needs particles that keep their neighbours, which the updated "
         f"formulation does not have: set {instead}, or `solver.formulation` to total."
@@ -440,7 +439,6 @@ class _Part(NamedTuple):
 
 
 def _parts(body: Formulation, k: int) -> Iterator[_Part]:
-    """The parts that the ``k``-th boundary pins."""
     boundary, own, count = body.boundaries[k], body.pinned[k], body.points.count
     position, mass = body.points.position.reshape(-1, count, 3).cpu().double(), body.points.mass.reshape(-1, count)
     given = boundary.at.detach().cpu().double() if isinstance(boundary, PinnedPoints) else position[0, :0]
@@ -703,11 +701,10 @@ def middle_plane(part: _Part, dx: float) -> tuple[Tensor, Tensor]:
 
 
 def cells_of_places(place: Tensor, grid: GridSpec, massive: Tensor) -> Tensor:
-    """The cell whose nodes all have mass, in or next to each place; the weights of another one would not add up to one.
+    """A cell in or next to each place whose 27 nodes all have mass, so that its weights add up to one.
 
     Args:
         place: Places at rest [m], shape (N, 3).
-        grid: The nodes.
         massive: Whether each node has mass, shape (G,).
 
     Returns:
@@ -799,7 +796,7 @@ class InKernels(NamedTuple):
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Within the block torch uses one thread: products of matrices round in another way for each number of them."""
+    """One thread of torch: products of matrices round differently for each number of threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -809,7 +806,6 @@ def _one_thread() -> Iterator[None]:
 
 
 def _stack(values: Sequence[Tensor], filling: float = 0) -> Tensor:
-    """Tensors filled up to the same shape."""
     most = [max(sizes) for sizes in zip(*(value.shape for value in values), strict=True)]
     pads = [[(0, m - n) for n, m in zip(value.shape[::-1], most[::-1], strict=True)] for value in values]
     return torch.stack(
@@ -893,7 +889,6 @@ class PinnedRows:
             kept += [Rows(*(field[some] for field in rows)) for some in chosen]
 
         def stacked(values: Sequence[Tensor], filling: float = 0) -> Tensor:
-            """Of all phases and scenes."""
             return _stack(values, filling).unflatten(0, (len(inverse), len(times))).transpose(0, 1).to(device)
 
         filling = (0, 0, 0, True, 0, -math.inf)
@@ -918,7 +913,7 @@ class PinnedRows:
 
     @_one_thread()
     def in_kernels(self, dtype: torch.dtype) -> InKernels:
-        """The same for the kernels, if the same points are at rest all the time."""
+        """The rows as the kernels need them; None unless the same points are pinned at rest throughout."""
         node, weight, C, W = (field[0] for field in (self.rows.node, self.rows.weight, self.C, self.W))
         inverse = W.mT @ W
         real = self.real
@@ -986,10 +981,6 @@ def _rows(
     """The rows of a part: the values of its points and, for a clamp, their slopes in units of one cell.
 
     Args:
-        body: The material and its boundaries.
-        k: The boundary.
-        part: What it pins.
-        grid: The nodes.
         massive: Which of them have mass, shape (G,).
         cell: First node of the cell of each particle of the scene, shape (P,).
         virtual: The nodes of each, shape (27, P); None for those of the lattice.

@@ -113,14 +113,14 @@ class Solver(nn.Module, ABC):
         """Compile what is needed; its errors are raised here."""
 
     def restiffen(self, youngs_modulus: Tensor, poisson_ratio: Tensor) -> bool:
-        """Give the material another stiffness, while a motion goes on.
+        """Change the stiffness of the material during a motion.
 
         Args:
             youngs_modulus: Young's modulus [Pa], shape (..., P).
             poisson_ratio: Poisson's ratio, shape (..., P).
 
         Returns:
-            False if nothing was done, as :meth:`init_state` has to take such a material.
+            False if the solver cannot; then call :meth:`init_state` with the new material.
         """
         return False
 
@@ -129,7 +129,7 @@ class Solver(nn.Module, ABC):
         raise ValueError(f"{type(self).__name__} has no other settings: give it a method `like`.")
 
     def embedded(self, place: Tensor, arm: Tensor | None, nodes: Tensor | None = None) -> EmbeddedPoints | None:
-        """An object that reads places in the material from a state; None to follow the nearest points.
+        """An object that interpolates places in the material from a state; None to follow the nearest points.
 
         Args:
             place: Rest positions that are read [m], shape (M, 3).
@@ -139,11 +139,11 @@ class Solver(nn.Module, ABC):
         return None
 
     def continued(self, other: Solver, state: Any, start: Any) -> Any:
-        """The motion of another solver as a state of this one; None if it cannot go on from it."""
+        """Continue the motion of another solver from its ``state``; None if this solver cannot."""
         return None
 
     def domain(self, state: Any) -> tuple[Sequence[float], Sequence[float]]:
-        """Lower and upper corner of the space that the solver covers now [m]: the box of the points, or a grid."""
+        """Lower and upper corner of the space that the solver covers now [m]."""
         return state.position.amin(0).tolist(), state.position.amax(0).tolist()
 
     def describe(self, state: Any) -> dict[str, Any]:
@@ -160,7 +160,6 @@ class Solver(nn.Module, ABC):
 
         Args:
             frame_dt: Length of the frame [s].
-            cells: The result of :meth:`cells_per_second`, if it is known.
         """
         if self.substep is not None:
             return fixed_substeps(frame_dt, self.substep, self.stable_substep(state), self.dx)

@@ -21,7 +21,7 @@ STRONGEST = 400.0
 def pull_force(F, velocity, position, point, numbers, now, table, OPTIONS):
     """Force and damping of a pull, as a device function of a force.
 
-    ``point``: where the point belongs from the place that ``now`` is [m], and the mass that is held [kg]. ``OPTIONS``:
+    ``point``: offset of the point's target from the place ``now`` [m], and the pulled mass [kg]. ``OPTIONS``:
     :data:`QUICK` and :data:`STRONGEST`.
     """
     away = add3(add3(now, 1.0, (point[0], point[1], point[2])), -1.0, position)
@@ -35,7 +35,8 @@ def pull(per_point: Callable[[], torch.Tensor], place: Callable[..., torch.Tenso
     """A pull of points towards a place that may move.
 
     Args:
-        per_point: Returns where each point belongs from the place [m], and the mass that is held, shape (..., P, 4).
+        per_point: Returns the offset of each point's target from the place [m], and the pulled mass [kg], shape (...,
+            P, 4).
         place: Returns the place [m] at the start of substeps, by time, substep and their number, shape (steps, 3).
     """
     own, now = Numbers(4, per_point), Numbers(3, place)
@@ -44,5 +45,5 @@ def pull(per_point: Callable[[], torch.Tensor], place: Callable[..., torch.Tenso
 
 
 def still_pull(points: torch.Size) -> DeviceFunction:
-    """A pull that holds nothing yet; ``points`` is the shape of a field of one number for each point."""
+    """A pull that holds nothing yet; ``points`` is the shape (..., P)."""
     return pull(lambda: torch.zeros(*points, 4), lambda time, dt, steps: torch.zeros(steps, 3))

@@ -102,7 +102,6 @@ class Run(ABC):
         """Return the reason why these kernels cannot run a body, or None if they can.
 
         Args:
-            bound: The formulation, bound to the body.
             interpret: Whether Triton's interpreter, if it is on, may run them on a CPU.
         """
         points = bound.points
@@ -150,10 +149,6 @@ class Run(ABC):
         """Advance by ``steps`` substeps of ``dt`` [s], with forces or with one constant force (see ``MPMSolver.step``).
 
         Args:
-            state: The state now.
-            dt: Substep [s].
-            steps: Number of substeps.
-            forces: Forces; those without a device function must be recordable.
             force: Force [N], shape (..., P, 3), or None; only without ``forces``.
             drag: Its resistance [kg/s], shape (..., P), or None.
             looks: Numbers of the substeps after which the wave speed is measured, if ``watches``.
@@ -190,14 +185,14 @@ class Run(ABC):
             return state, self.speed[0] / self.settings.dx
 
     def begin(self, steps: int, loaded: bool) -> None:
-        """Fill what some substeps read besides the state and the schedule."""
+        """Upload what substeps read besides the state and the schedule."""
         self.first_step.zero_()
         self.loads.begin(self.time, self.dt, steps)
         if loaded:
             self.load.zero_()
 
     def options_for(self, device_functions: Sequence[DeviceFunction]) -> dict[str, Any]:
-        """Constants of the kernels of a substep with some forces alone, whose numbers are copied if they changed."""
+        """Compile options of the kernels for some forces; uploads changed parameters."""
         values = self.loads.take(device_functions, MAX_STEPS)
         check_indices(self.loads.layout.size)
         if values is not None:
@@ -212,7 +207,7 @@ class Run(ABC):
         }
 
     def table(self, kick: float, dt: float, steps: int) -> Tensor:
-        """The schedule on the host, which can be copied without making it wait."""
+        """The schedule in pinned memory, for a copy without waiting."""
         first, other = (math.exp(-self.settings.damping * time) for time in (kick, dt))
         real = self.like["dtype"]
         table = torch.empty(steps + 2, kernels.SCHEDULE, dtype=real, pin_memory=self.device.type == "cuda")
@@ -270,18 +265,15 @@ class Run(ABC):
         return added([split(force(state), force, state) for force in self.asked])
 
     def _asked_key(self) -> tuple[object, ...]:
-        """Return the key of the recorded forces."""
         return recorded_key(self.asked) if self.asked else ()
 
     def _resists(self, state: MPMState) -> bool:
-        """True if a force in torch returns a resistance; calls each force once."""
         key = self._asked_key()
         if key != self._resist[0]:
             self._resist = key, self._ask(state)[1] is not None
         return self._resist[1]
 
     def _push(self) -> None:
-        """Compute the forces in torch from the particles in the buffers, and fill the force buffer."""
         self._fill(*self._ask(self._look_at()))
 
     def _room(self, name: str, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
@@ -323,7 +315,7 @@ class Run(ABC):
 
 @contextmanager
 def at_home(buffer: Tensor) -> Iterator[None]:
-    """Within the block, launch Triton on the device of a buffer, and create tensors that can be written in any mode."""
+    """Within the block, launch Triton on a buffer's device, and create tensors outside inference mode."""
     with torch.cuda.device_of(buffer), torch.inference_mode(False), torch.no_grad():
         yield
 

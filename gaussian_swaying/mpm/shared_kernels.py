@@ -112,7 +112,7 @@ def _columns(values, count, index, mask, FIRST: tl.constexpr, COUNT: tl.constexp
 def numbers_of_force(
     k: tl.constexpr, FORCES: tl.constexpr, index, mask, scene, values, count, vectors, scenes, step, numbers
 ):  # fmt: skip
-    """The numbers that the device function of force k gets: of its points, of all, and of the substep."""
+    """The parameters of force k: per point, shared, and per substep."""
     point = _columns(values, count, index, mask, FORCES.per_point[k][0], FORCES.per_point[k][1])
     row = vectors + (step * scenes + scene) * FORCES.width
     own = read(numbers, FORCES.numbers[k][0], FORCES.numbers[k][1])
@@ -150,7 +150,7 @@ def sum_of_forces(
 
 @triton.jit
 def add_given(force, resistance, force_in, where, mask):
-    """Add the force and the resistance in the rows of ``force_in``."""
+    """Add the given force and resistance, rows of ``force_in``."""
     more = load3(force_in, 1, where * 4, mask)
     resistance += tl.load(force_in + where * 4 + 3, mask, 0.0)
     return add3(force, 1.0, more), resistance
@@ -158,7 +158,7 @@ def add_given(force, resistance, force_in, where, mask):
 
 @triton.jit
 def account(force, resistance, velocity, kick, before, IMPLICIT: tl.constexpr, load, count, index, mask):
-    """Work of the external force: adds the part that ends with this velocity, stores the part that starts with it.
+    """Accumulate the work of external forces: the part that ends with this velocity; store the next part's start.
 
     ``load`` has the rows work, force (with implicit drag force + D v, D and v, eight rows in all).
     """
@@ -181,7 +181,7 @@ def account(force, resistance, velocity, kick, before, IMPLICIT: tl.constexpr, l
 
 @triton.jit
 def squared_stretch(F, mu, lam):
-    """The square of the largest stretch, at least 1; the arguments are those of the wave of a law."""
+    """Square of the largest stretch, at least 1; arguments as a law's wave."""
     return largest(largest_eigenvalue(matmul(transpose(F), F)), 1.0)
 
 
@@ -196,7 +196,7 @@ def wave_speed(F, density, mu, lam, WAVE: tl.constexpr, SPATIAL: tl.constexpr):
 
 @triton.jit
 def keep_largest(out, speed, mask):
-    """Write the largest value to ``out``; infinity for NaN, which an atomic maximum would drop."""
+    """Atomic maximum into ``out``; NaN becomes infinity, which the maximum would drop."""
     speed = tl.where(mask, tl.where(speed == speed, speed, float("inf")), 0.0)
     tl.atomic_max(out, tl.max(speed), sem="relaxed")
 

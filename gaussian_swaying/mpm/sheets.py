@@ -67,13 +67,6 @@ def flattened(F, n, mu, lam):
     The sheet has the unit normal m, along cof(F) n, and the area ratio a, its length. The thickness ratio h has no
     stress across the sheet for fixed corotated elasticity, :math:`h = (2 \mu + \lambda a) / (2 \mu + \lambda a^2)`, and
     to first order for other laws.
-
-    Args:
-        mu: Shear modulus [Pa].
-        lam: First Lamé parameter [Pa].
-
-    Returns:
-        :math:`\hat F`, m, a, h and h'(a).
     """
     turned = matvec(cofactor(F), n)
     area = tl.sqrt(tl.maximum(dot3(turned, turned), _LEAST * _LEAST))
@@ -88,7 +81,7 @@ def flattened(F, n, mu, lam):
 
 @triton.jit
 def without_normal(a, n):
-    """A matrix A (I - n n^T)."""
+    """The tangential part A (I - n n^T) of a matrix."""
     return axpy9(1.0, a, -1.0, outer3(matvec(a, n), n))
 
 
@@ -157,7 +150,7 @@ def stress_of_sheets(F: Tensor, normal: Tensor, mu: Tensor, lam: Tensor, pk1: Ca
 
 
 def director_energy(F: Tensor, normal: Tensor, mu: Tensor) -> Tensor:
-    """Energy density W of what F does across sheets [J/m³], shape (...); the arguments are those of a sheet's stress.
+    """Energy density of transverse shear and thickness change of sheets [J/m³], shape (...).
 
     It is :data:`DIRECTOR` times mu times half the square of the shear and a quarter of that of n C n - 1.
     """
@@ -191,7 +184,7 @@ class Bending:
 
     @torch.no_grad()
     def rows(self) -> Tensor:
-        """Rows v of each cell, as few as the rank of its matrix, the sum of v v^T; shape (K, rank of all, 27)."""
+        """A factorisation of each cell's matrix: rows v with sum v v^T; shape (K, rank of all, 27)."""
         parts = [torch.linalg.eigh(in_double(some)) for some in self.stiffness.split(_AT_ONCE)]
         values, vectors = (torch.cat(column) for column in zip(*parts, strict=True))
         least = 27 * torch.finfo(self.stiffness.dtype).eps * values[:, -1:]
@@ -220,7 +213,6 @@ def bending_of(points: MaterialPoints, stencil: Stencil, dx: float, softened: Te
     """The bending of the sheets of a material; None if it has none.
 
     Args:
-        dx: Grid spacing [m].
         softened: Factor of the stiffness of each point, shape (..., P); None for one.
     """
     if points.bending is None or points.normal is None:
@@ -253,7 +245,6 @@ def second_derivatives(fraction: Tensor, normal: Tensor, dx: float) -> Tensor:
     Args:
         fraction: Place in cells from the first of the three nodes of each axis, shape (K, 3).
         normal: Unit normals, shape (K, 3).
-        dx: Grid spacing [m].
 
     Returns:
         Along the first direction twice, the second one twice, and both, shape (K, 3, 27).

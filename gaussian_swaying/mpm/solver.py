@@ -277,12 +277,12 @@ class MPMSolver(Fixed, Solver):
         return ("modes", "it is held, and nothing touches or folds") if why is None else ("total", why.split(": ")[0])
 
     def choose(self, *, anew: bool) -> None:
-        """Let ``auto`` choose anew with the next material, or keep its choice, as while a simulation runs."""
+        """Let ``auto`` choose anew with the next material, or keep its choice."""
         self._decided = not anew
         self._no_modes = None if anew else self._no_modes
 
     def rule_out_modes(self, why: str) -> None:
-        """Let ``auto`` be ``total`` from the next :meth:`init_state` on."""
+        """Make ``auto`` take ``total`` instead of ``modes`` from the next :meth:`init_state` on."""
         self._no_modes = why
 
     def _why_not_kernels(self, bound: Formulation) -> str | None:
@@ -316,7 +316,6 @@ class MPMSolver(Fixed, Solver):
         return self._kernels
 
     def _wanted(self, *tensors: Tensor | None) -> bool:
-        """True if the body or one of some tensors requires a gradient, and gradients are enabled."""
         asking = (*self.bound.tensors(), *tensors)
         return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in asking)
 
@@ -405,9 +404,6 @@ class MPMSolver(Fixed, Solver):
             horizon: Time for which the grid must be large enough [s]; estimated from twice the current speeds and
                 gravity.
             margin: Extra cells on each side, for motion caused by the wind and the boundaries.
-
-        Returns:
-            The state with its new grid.
 
         Raises:
             FloatingPointError: If a position or a speed is NaN or infinite.
@@ -618,18 +614,7 @@ class MPMSolver(Fixed, Solver):
 
 
 def _check_begin(bound: Formulation, state: MPMState, dt: float, steps: int, limit: bool = True) -> int:
-    """Check the arguments of a rollout.
-
-    Args:
-        bound: The formulation, bound to its material.
-        state: The state to start from.
-        dt: Substep [s].
-        steps: Number of substeps.
-        limit: Whether to refuse a substep with which nothing is stable.
-
-    Returns:
-        The number of substeps as an integer of Python.
-    """
+    """Check the arguments of a rollout."""
     _check_state(bound, state)
     if isinstance(dt, bool) or not isinstance(dt, Real):
         raise TypeError(f"Expected `dt` to be a number of seconds, but got {type(dt).__name__}.")
@@ -703,11 +688,6 @@ def _check_end(
     """Raise an error if the state after a rollout is not valid (one GPU synchronisation).
 
     Args:
-        bound: The formulation, bound to its material.
-        before: The state at the start of the rollout.
-        after: The state at its end.
-        dt: Substep [s].
-        steps: Number of substeps.
         forces: The forces that acted; called once more, for the first substep, if something is NaN.
     """
     check_pace(dt, bound.obstacle_cells(before, steps * dt), "dt")

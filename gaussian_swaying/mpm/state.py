@@ -41,7 +41,6 @@ class GridSpec:
 
     @property
     def lattice_count(self) -> int:
-        """Number of nodes of one scene without virtual ones."""
         return self.resolution[0] * self.resolution[1] * self.resolution[2]
 
     @property
@@ -49,7 +48,6 @@ class GridSpec:
         return self.lattice_count + self.virtual
 
     def holds(self, other: GridSpec) -> bool:
-        """True if all nodes of another grid are among those of this one."""
         inside = (
             a <= b and b + m <= a + n
             for a, n, b, m in zip(self.offset, self.resolution, other.offset, other.resolution, strict=True)
@@ -87,10 +85,6 @@ def bounding_grid(low: Tensor, high: Tensor, dx: float, margin: int) -> GridSpec
     Args:
         low: Smallest coordinates of the points [m], shape (3,).
         high: Largest coordinates of the points [m], shape (3,).
-        dx: Grid spacing [m].
-
-    Returns:
-        The grid.
     """
     # Python integers, which do not overflow
     first = [math.floor(x) - margin for x in (low / dx - 0.5).tolist()]
@@ -288,7 +282,7 @@ class MaterialPoints:
 
     @property
     def elastic(self) -> Tensor | None:
-        """The points whose law has no return map, bool, shape (..., P); None if all of them."""
+        """Mask of points without plastic flow, shape (..., P); None if that is all of them."""
         if not any(law.plastic for law in self.laws):
             return None
         each = torch.tensor([not law.plastic for law in self.laws], device=self.position.device)
@@ -304,7 +298,6 @@ class MaterialPoints:
 
 
 def _check_attached(attached: Tensor, count: int) -> None:
-    """Raise ValueError unless it is a number for each point, or pairs of points."""
     if attached.dtype != torch.int64 or not (attached.shape == (count,) or attached.shape[1:] == (2,)):
         raise ValueError(
             f"Expected `attached` to be int64, of shape ({count},) with a number for each point or (E, 2) with pairs "
@@ -315,7 +308,6 @@ def _check_attached(attached: Tensor, count: int) -> None:
 
 
 def _optional(parts: Sequence[MaterialPoints]) -> dict[str, list[Tensor]]:
-    """The optional fields that one of several bodies has, for all of them: zero where one has none."""
     found = {}
     for name in _OPTIONAL_FIELDS:
         given = [getattr(part, name) for part in parts]
@@ -381,19 +373,17 @@ class State:
         return {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
 
     def scene(self, index: int) -> Self:
-        """One scene of a batch; its tensors are views."""
         own = {k: v[index] for k, v in self.fields().items() if isinstance(v, Tensor) and k != "time"}
         if self.F_total is self.F_elastic:
             own["F_total"] = own["F_elastic"]
         return self.replace(**own)
 
     def tensors(self) -> list[Tensor]:
-        """The fields that may require a gradient."""
+        """Fields that may require a gradient."""
         without = ("lost", "time", "work", "impulse", "air")
         return [v for k, v in self.fields().items() if isinstance(v, Tensor) and k not in without]
 
     def state_dict(self) -> dict[str, Any]:
-        """The state as plain tensors and numbers, for ``torch.save``."""
         return self.fields() | ({"F_total": None} if self.F_total is self.F_elastic else {})
 
     @classmethod

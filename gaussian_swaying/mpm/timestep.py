@@ -128,7 +128,7 @@ def fixed_substeps(frame_dt: float, substep: float, limit: float, dx: float) -> 
 
 
 def check_pace(dt: float, cells: float, name: str) -> None:
-    """Raise ValueError if an obstacle that crosses so many cells per second jumps over nodes in ``dt`` [s]."""
+    """Raise ValueError if an obstacle would skip nodes in a substep of ``dt`` [s]."""
     if dt * cells > 1:
         raise ValueError(
             f"An obstacle moves by {dt * cells:.3g} cells in a substep of {dt:g} s, so it would pass through the "
@@ -160,7 +160,7 @@ def rounding_speed(speed: float, dt: float, steps: float, dx: float, dtype: torc
 
 
 def kick_time(state: MPMState, dt: float) -> float:
-    """Return the time for which forces act in a substep of ``dt`` [s] from a state; see ``MPMSolver.step``."""
+    """Time for which forces act in a substep of ``dt`` [s]; see ``MPMSolver.step``."""
     return min(0.5 * (state.substep + dt), 2 * dt) if state.substep > 0 else dt
 
 
@@ -184,6 +184,6 @@ def cfl_number(dt: float | Tensor, dx: float, speed: Tensor, velocity: Tensor | 
 
 
 def look_marks(steps: int, looks: int) -> list[int]:
-    """Numbers of the substeps after which to check: multiples of the substeps in a CUDA graph, and the last one."""
+    """Substeps after which to check: multiples of a CUDA graph's substeps, and the last one."""
     unit = max(size for size in Repeater.SIZES if size == 1 or looks * size <= 2 * steps)
     return sorted({min(unit * math.ceil((k + 1) * steps / (looks * unit)), steps) for k in range(looks)})

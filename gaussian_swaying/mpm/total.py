@@ -126,7 +126,6 @@ class Total(Formulation):
         return other
 
     def _summed(self, values: Tensor) -> Tensor:
-        """Sums of values of the particles (..., P, K) by nodes (..., G, K); also on a GPU in a fixed order."""
         return scatter(self.stencil, values[..., None, :], fixed_order=True)
 
     def _virtual_nodes(self, snap: float) -> VirtualNodes | None:
@@ -186,7 +185,6 @@ class Total(Formulation):
         return _RigidNodes(held.mass > 0, rest, torch.where(held.share > held.threshold, mass, 0.0))
 
     def _check_bodies(self) -> None:
-        """Raise ValueError if two rigid parts share nodes."""
         for k, body in enumerate(self.rigid_bodies):
             for other, before in enumerate(self.rigid_bodies[:k]):
                 if bool(((body.mass > 0) & (before.mass > 0)).any()):
@@ -208,7 +206,6 @@ class Total(Formulation):
         return ContactStage(surface, self.boundaries, self.kinds, self.grid, inverse, nodes)
 
     def _on_nodes(self, k: int, held: Pinned) -> Pinned:
-        """Return the particles that the ``k``-th boundary holds, with their constant share of the mass of each node."""
         boundary, face = self.boundaries[k], self.kinds[k] == FACE
         share = self._summed(held.mass[..., None])[..., 0] * self.node_inverse_mass
         threshold = PINNED_ALONE if face else boundary.pinned_share
@@ -228,7 +225,6 @@ class Total(Formulation):
         return self.grid
 
     def first_state(self, velocity: Tensor, margin: int) -> MPMState:
-        """The state at time zero, with velocities interpolated from the nodes."""
         state = super().first_state(velocity, margin)
         momentum = self._summed(self.points.mass[..., None] * velocity)
         node_velocity = momentum * self.node_inverse_mass[..., None]
@@ -293,7 +289,7 @@ class Total(Formulation):
         return matrix - matrix @ n @ n.mT
 
     def in_shape(self, state: MPMState) -> MPMState:
-        """The state with nodes and particles of rigid parts exactly where these are, and sheets in plane stress.
+        """The state with rigid parts exactly in shape, and sheets in plane stress.
 
         Particles at the border of a part have a small share of nodes that are not of it.
         """
@@ -356,7 +352,7 @@ class Total(Formulation):
         return 0.5 * (self.node_mass * state.nodal[1].square().sum(-1)).sum(-1)
 
     def sheet_energy(self, state: MPMState) -> Tensor | float:
-        """Energy of bending, and of what F does across sheets, whose membrane is that of the law."""
+        """Energy of bending and of transverse shear of sheets [J]; the laws have the membrane's."""
         if self.bending is None:
             return 0.0
         displacement = state.nodal[0]
@@ -516,13 +512,11 @@ class TotalRun(Run):
         return self.plain and (self.touching is None or None not in self.touching.solids)
 
     def restiffen(self, bound: Total) -> None:
-        """Take a body of another stiffness; what was recorded stays."""
         self.bound = bound
         for row, values in zip(self.material[1:3], (bound.laws.mu, bound.laws.lam), strict=True):
             row.copy_(values.reshape(-1)[self.order.long()])
 
     def _take_sheets(self) -> None:
-        """The sheets that bend by themselves: the normals of their points, and their matrices."""
         bending = self.bound.bending
         self.bent, self.normals = 0, self.fraction
         if bending is None:
@@ -544,7 +538,6 @@ class TotalRun(Run):
         )  # fmt: skip
 
     def _take_pins(self) -> None:
-        """Collect the nodes and points that pins without a time window hold."""
         bound, active = self.bound, self.active.long()
         owner = torch.full((self.bound.node_mass.numel(),), -1, device=self.device)
         for k in reversed(range(len(bound.pinned)) if self.plain else ()):  # the first pin takes the momentum
@@ -566,12 +559,7 @@ class TotalRun(Run):
             self.residual = torch.zeros(2, self.points.node.shape[1], 4, **self.like)  # now, and its sum
 
     def cut(self, sizes: Tensor, programs: int) -> None:
-        """Cut crowded cells into pieces: otherwise a body of few cells has too few programs to fill a GPU.
-
-        Args:
-            sizes: Number of particles of each cell.
-            programs: Least number of pieces.
-        """
+        """Split crowded cells into pieces, so that a body of few cells has enough programs to fill a GPU."""
         most = self.lanes * max(1, -(-self.count // (self.lanes * programs)))
         counts = -(-sizes // most)
         first = counts.cumsum(0) - counts
@@ -610,7 +598,6 @@ class TotalRun(Run):
         return self._fields(found, self.taken_and_done.clone(), part)
 
     def _once(self, state: MPMState, part: Part) -> Tensor:
-        """The fields after the part, see :meth:`_fields`."""
         for to, value in zip((self.displacement, self.velocity), state.nodal, strict=True):
             to[:, :3].copy_(value.reshape(-1, 3))
         options = part.options
@@ -655,7 +642,6 @@ class TotalRun(Run):
         )  # fmt: skip
 
     def substep(self, offset: int, options: dict[str, Any]) -> None:
-        """Launch one substep, ``offset`` after the first one."""
         if self.asked:
             self._push()
         width = 8 if self.position else 4
@@ -707,7 +693,6 @@ class TotalRun(Run):
             self.pass_time()
 
     def _hold_points(self, points: InKernels, offset: int) -> None:
-        """Stop the held points: their velocities, then those of the nodes around them."""
         rows, block = points.node.shape[1], lanes(self.device, 4, 1)
         launch(kernels.total_rows, (-(-rows // block),))(
             points.node, points.weight, rows, self.fields, self.residual, BLOCK=block, num_warps=1
@@ -719,7 +704,6 @@ class TotalRun(Run):
         )  # fmt: skip
 
     def _impulse(self) -> Tensor:
-        """Reaction impulse on each boundary in this part of the rollout, shape of ``impulse``; in a fixed order."""
         total = self.impulse.reshape(self.scenes, -1, 3).clone()
         if any(self.bound.on_nodes) and self.plain:
             for k, nodes in enumerate(self.own_nodes):
@@ -748,7 +732,6 @@ class TotalRun(Run):
         self.displacement.addcmul_(self.velocity, self.dt.to(self.velocity.dtype))
 
     def _read(self, found: Tensor, part: Part) -> None:
-        """Write all fields of the state into ``found``; also the reaction impulses and the work of the load."""
         to = self._views(found)
         kick, implicit = self.schedule[0, 3:], part.options["IMPLICIT"]
         self._read_into(to["position"], to["velocity"], to["affine"], to["F"], kick, part.loaded, implicit)
@@ -767,7 +750,6 @@ class TotalRun(Run):
         return views
 
     def _fields(self, found: Tensor, taken_and_done: Tensor, part: Part) -> dict[str, Any]:
-        """Return the fields that :meth:`_read` wrote, by the names of the state."""
         views, taken = self._views(found), self.impulse.numel()
         F, work = views["F"], {"work": taken_and_done[taken:].view(self.bound.points.mass.shape[:-1])}
         return {
@@ -782,7 +764,6 @@ class TotalRun(Run):
     def _read_into(
         self, position: Tensor, velocity: Tensor, affine: Tensor, F: Tensor, kick: Tensor, work: bool, implicit: bool
     ) -> None:
-        """Compute the particle fields from the nodes, and complete the work of forces that acted for ``kick``."""
         _, ny, nz = self.grid.resolution
         block = lanes(self.device, 128)
         launch(kernels.total_read, (-(-self.count // block),))(
@@ -825,7 +806,6 @@ def _sources(cell: Tensor, cells: int) -> Tensor:
 
     Args:
         cell: The cell in each of the 27 places around each node, shape (27, nodes); ``cells`` where there is none.
-        cells: Number of cells.
     """
     none = cell == cells
     most = int((~none).sum(0).amax()) if none.shape[1] else 0  # material too light has no nodes
@@ -873,8 +853,6 @@ def _by_scene(nodes: Tensor, scene: Tensor, scenes: int) -> Tensor:
 
     Args:
         nodes: Places among the active nodes, which are sorted by scene, shape (n,).
-        scene: Scene of each active node.
-        scenes: Number of scenes.
     """
     counts = scene[nodes].bincount(minlength=scenes)
     rows = torch.full((scenes, int(counts.amax()) if len(nodes) else 0), len(scene), device=nodes.device)

@@ -41,7 +41,7 @@ _SHAPED = {"flat": 9, "m": 3, "area": 0, "thickness": 0, "thinning": 0}
 
 
 class Adjoints(Constant):
-    """The adjoints of what a body and its force are computed by, derived when a gradient is first wanted.
+    """Adjoints of a body's laws and force, derived on first use.
 
     Args:
         laws: The laws.
@@ -58,7 +58,6 @@ class Adjoints(Constant):
 
 @cache
 def _derived() -> tuple[Any, ...]:
-    """The adjoints of ``kelvin_voigt``, ``flattened`` and ``sheet_stress``."""
     return (
         vjp(kelvin_voigt, {"F": 9, "rate": 9, "mu": 0, "lam": 0, "time": 0}, ("F", "rate", "mu", "lam")),
         vjp(flattened, {"F": 9, "n": 3, "mu": 0, "lam": 0}, ("F", "mu", "lam")),
@@ -89,7 +88,6 @@ def keep_rows(residual, rows, history, first_step, step_offset, BLOCK: tl.conste
 
 @triton.jit
 def _add(to, value, real, chunk):
-    """Write the sums of some cells; from the second chunk of particles on, add to what is there."""
     if chunk > 0:
         value += tl.load(to, real, 0.0)
     tl.store(to, value, real)
@@ -218,7 +216,6 @@ def bend_adjoint(bent_node, fields, force_bar, found):
 
 @triton.jit
 def _across(m, x, y):
-    """The first two columns of a matrix times two numbers."""
     return (m[0] * x + m[1] * y, m[3] * x + m[4] * y, m[6] * x + m[7] * y)
 
 
@@ -302,7 +299,7 @@ def hold_adjoint(
     weight_bar, multipliers, all_rows, inverse_mass, history, active_count, first_step, step_offset, last,
     WEIGHTS: tl.constexpr, BLOCK: tl.constexpr, ROWS: tl.constexpr,
 ):  # fmt: skip
-    """Subtract the rows, with weights of shape (nodes, rows), times their multipliers from the gradient.
+    """Subtract the weighted rows times their multipliers from the gradient.
 
     WEIGHTS adds the gradient by the weights: less the forward multiplier times the gradient by the momentum, and less
     that of the gradient times the velocity after the substep.
@@ -354,7 +351,6 @@ class TotalAdjoint(TotalRun):
     """Number of times that the buffers of a backward pass were made."""
 
     def _prepare(self) -> None:
-        """Make the buffers of a backward pass."""
         self.nodes, self.place = len(self.active), self.active.long()
         self.force_bar = torch.zeros_like(self.fields)
         self.bars, self.mass_bar, self.material_bar, self.history, self.shares = (
@@ -367,7 +363,6 @@ class TotalAdjoint(TotalRun):
         self._take_rows()
 
     def _take_rows(self) -> None:
-        """The held points as dense matrices: what rows push, and their weights on the nodes that they move."""
         points, pinned = self.points, self.bound.pinned_rows
         if points is None or pinned is None:
             return
@@ -421,7 +416,6 @@ class TotalAdjoint(TotalRun):
         checkpoint: int,
         watch: Callable[[int], None] | None,
     ) -> MPMState:
-        """As ``MPMSolver.rollout``; gradients reach nodal fields, stiffness, mass, volume, wind and coefficients."""
         if steps == 0:
             return state
         if not self.made:
@@ -706,7 +700,7 @@ class _Rollout(torch.autograd.Function):
 
 
 def segment(steps: int, checkpoint: int, nodes: int) -> int:
-    """Substeps of a segment: as asked for, else about the square root of all, or more if they fit in 128 MiB.
+    """Substeps of a segment: as requested, else about the square root of all, or more if they fit in 128 MiB.
 
     It is a multiple of what a graph repeats.
     """
@@ -717,5 +711,4 @@ def segment(steps: int, checkpoint: int, nodes: int) -> int:
 
 
 def _own(tensor: Tensor, nodal: tuple[Tensor | None, ...]) -> bool:
-    """True if a field of particles is a leaf that requires a gradient, and not a nodal field."""
     return tensor.requires_grad and tensor.is_leaf and not any(tensor is t for t in nodal)

@@ -285,7 +285,6 @@ def total_join(source, counts, nodes, partial, joined, WIDTH: tl.constexpr):
 
 @triton.jit
 def _end(node, k, mask, v, d, inverse, held, taken, fields, dt, HELD: tl.constexpr, MOVE: tl.constexpr):
-    """Stop the held nodes and sum the reaction impulses, write the velocities, and move the nodes from ``d``."""
     if HELD:
         free = tl.load(held + k, mask, 0) == 0
         stopped = mask & (free == 0)

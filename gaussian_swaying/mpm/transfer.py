@@ -89,9 +89,6 @@ def bspline_stencil(
         snap: A particle within ``snap * dx`` of a plane where a weight vanishes is moved onto it for this stencil, so
             that no node is left with only a vanishing mass.
 
-    Returns:
-        The support of each particle.
-
     Example:
         >>> stencil = bspline_stencil(torch.full((1, 3), 0.5), GridSpec(0.1, (0, 0, 0), (10, 10, 10)))
         >>> bool(stencil.inside.all()), stencil.basis.shape

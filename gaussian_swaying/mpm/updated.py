@@ -357,7 +357,6 @@ class UpdatedRun(Run):
         return sorted_for(self.crowd, self.crossing, self.count)
 
     def _measure_crossing(self) -> None:
-        """Measure how many cells a particle enters in a substep, on average, without waiting."""
         if not self.atomic:
             return
         self._measured.copy_(self._crossing(self.moving[12:15]), non_blocking=True)
@@ -385,13 +384,11 @@ class UpdatedRun(Run):
         return found[: self.scenes]
 
     def _start(self, options: dict[str, Any]) -> None:
-        """The start of a substep without the end of the one before."""
         if self.asked:
             self._push()
         self._particles(0, options, gather=False, scatter=True)
 
     def _sort(self) -> None:
-        """Sort the rows of the particles by cell: count those of each cell, and move each to its place."""
         if not self.atomic:
             order = torch.argsort(self._keys(self.moving[:3].T), stable=True)
             self.moving.copy_(self.moving[:, order])
@@ -455,7 +452,6 @@ class UpdatedRun(Run):
         )
 
     def substep(self, offset: int, options: dict[str, Any]) -> None:
-        """Launch one substep, ``offset`` after the first one."""
         self._nodes(offset, options)
         if self.asked:  # the forces need the end of a substep before the next one starts
             self._particles(offset + 1, options, gather=True, scatter=False)
@@ -544,7 +540,6 @@ class UpdatedRun(Run):
         return (weight * self.inverse_mass[:nodes]).reshape(shape)
 
     def _read(self, room: Callable[..., Tensor]) -> dict[str, Any]:
-        """Particle fields, in tensors that ``room`` makes for a name and a shape."""
         shape = self.bound.points.position.shape
         fields: dict[str, Any] = {name: room(name, *shape) for name in ("position", "velocity")}
         fields |= {name: room(name, *shape, 3) for name in ("affine", "F_elastic")}
@@ -572,7 +567,6 @@ def crowd_of(position: Tensor, dx: float) -> float:
 
     Args:
         position: Rest positions [m], shape (..., P, 3).
-        dx: Grid spacing [m].
     """
     flat = position.reshape(-1, *position.shape[-2:])[0]
     sizes = torch.unique(torch.floor(flat / dx - 0.5).int(), dim=0, return_counts=True)[1].double()
@@ -580,7 +574,7 @@ def crowd_of(position: Tensor, dx: float) -> float:
 
 
 def sorted_for(crowd: float, crossing: float, count: int) -> int:
-    r"""Return the number of substeps after which to sort again.
+    r"""Number of substeps between sorts that costs the least time.
 
     As the order gets stale, particles in a row no longer share their cell, and more atomic sums meet: the time of a
     substep grows with their share. Together with the time of the sorts it is least after :math:`\sqrt{S / r}` substeps,

@@ -95,7 +95,6 @@ def _sum_segments(a, lane, first):
 
 @triton.jit
 def _locate(x, dx, o, n):
-    """First node of the stencil on one axis of the grid, the position in it, and whether the stencil fits."""
     lattice = tl.div_rn(x, dx + x * 0)
     base = tl.floor(lattice - 0.5)
     first = base.to(tl.int32) - o
@@ -106,7 +105,6 @@ def _locate(x, dx, o, n):
 
 @triton.jit
 def _stencil(x, mask, scene, ox, oy, oz, nx, ny, nz, dx):
-    """First node around some places, their place in its cell, and whether the grid has all of their nodes."""
     bx, fx, okx = _locate(x[0], dx, ox, nx)
     by, fy, oky = _locate(x[1], dx, oy, ny)
     bz, fz, okz = _locate(x[2], dx, oz, nz)
@@ -501,7 +499,7 @@ def updated_load(
     order, position, velocity, affine, F_elastic, F_total, lost, internal, constants, moving, count,
     PLASTIC: tl.constexpr, INTERNAL: tl.constexpr, VALUES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """``updated``: particle fields, and ``constants`` (P, 5 + VALUES), the other rows, into the rows of ``moving``."""
+    """``updated``: copy particle fields and ``constants`` (P, 5 + VALUES) to the rows of ``moving``."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = index < count
     where = tl.load(order + index, mask, 0)

@@ -115,7 +115,7 @@ def first_nodes(place: Tensor, grid: GridSpec) -> Tensor:
 
 @torch.no_grad()
 def point_with_nodes(first: Tensor, near: Tensor, point_first: Tensor, point_node: Tensor, grid: GridSpec) -> Tensor:
-    """For places next to material points: a point in the same cell whose nodes are the place's own.
+    """For places next to material points: a point in the same cell whose nodes the place can use.
 
     A place takes the nodes of the point next to it if they share a cell. Otherwise it takes those of a point in its
     cell that has no other copy of any node that both reach.

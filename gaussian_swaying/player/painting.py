@@ -69,7 +69,6 @@ class Strokes:
         self.roles = self._roles_of(self.labels)
 
     def __len__(self) -> int:
-        """The number of strokes that can be taken back."""
         return len(self._past)
 
     @property
@@ -102,7 +101,6 @@ class Strokes:
         self._label(index, torch.full_like(index, place))
 
     def take_back(self) -> None:
-        """Take the last stroke back; nothing happens without one."""
         if self._past:
             last = self._past.pop()
             self.known = last.known
@@ -132,7 +130,7 @@ class Mark:
     length: float = 0.0
 
     def is_dab(self, key: str, place: list[float]) -> bool:
-        """True if the stroke is one of a browser, and stayed at a place [pixels]."""
+        """True if a stroke has this key and stayed at a place [pixels]."""
         return key == self.key and self.length <= NEAR and math.dist(self.start, place) <= NEAR
 
 
@@ -173,7 +171,7 @@ class Painting:
         self._show()
 
     def stop(self) -> None:
-        """Paint no longer; the simulation goes on if it did before, and what was painted is kept."""
+        """Stop painting and keep the strokes; a simulation that ran before goes on."""
         if self.on:
             self.on = False
             self._show()
@@ -184,7 +182,7 @@ class Painting:
         self._strokes = self._view = self._mark = None
 
     def shown(self) -> dict[str, Any]:
-        """What the page shows, for JSON: the parts with name, tint and number of Gaussians, and what can be done."""
+        """State of the painting for the page (JSON): parts with tint and count, and possible actions."""
         strokes = self._strokes
         scene = self.session.simulation.scene
         found: dict[str, Any] = {"on": self.on, "apply": strokes is not None, "parts": []}
@@ -198,7 +196,6 @@ class Painting:
         return found
 
     def _adopt(self, simulation: Simulation) -> Strokes:
-        """The strokes on the Gaussians of a simulation; those on others are forgotten."""
         scene, settings = simulation.scene, self.session.settings.scene
         source = (str(settings.ply), str(settings.generator), str(len(scene.drawn)))
         if self._strokes is None or source != self._source:
@@ -214,7 +211,7 @@ class Painting:
         self.roles = roles
 
     def paint(self, key: str, told: Mapping[str, Any]) -> None:
-        """Do what the brush of a browser did; nothing while no one paints.
+        """Handle a brush message of a browser; ignored while painting is off.
 
         Args:
             told: Its message: ``path`` in its window [pixels], the ``part``, and how it looks (:class:`.Eye`). A piece
@@ -258,7 +255,6 @@ class Painting:
         self._show()
 
     def _seen(self, snapshot: Snapshot, eye: Eye) -> Seen:
-        """The Gaussians as a browser sees them; kept until it looks from elsewhere, or they move."""
         key = (snapshot.number, eye.size, eye.fov, eye.near, eye.matrix.tolist())
         if self._view is not None and self._view[0] == key:
             return self._view[1]
@@ -290,7 +286,6 @@ class Painting:
             self._show()
 
     def apply(self) -> None:
-        """Let the simulation take the parts, from rest."""
         strokes, session = self._strokes, self.session
         if strokes is None:
             return
@@ -314,14 +309,14 @@ class Painting:
                 shutil.rmtree(folder)
 
     def saved(self, path: Path) -> bytes:
-        """The content of a file with the parts as they are painted, which is written to a path."""
+        """Write the painted parts to a file and return its content."""
         parts = self.session.simulation.scene.parts if self._strokes is None else self._strokes.parts()
         if parts is None:
             raise ValueError("The scene has no parts: paint some first.")
         return parts.save(path).read_bytes()
 
     def as_saved(self, text: str) -> str:
-        """A configuration that is saved from the page; parts whose file goes away with the page lie beside it."""
+        """A configuration for download, whose parts file lies beside it."""
         path = Path(str(self.session.settings.scene.parts))
         if not path.is_relative_to(self._folder):
             return text
@@ -334,7 +329,7 @@ def _in_source(simulation: Simulation, index: Tensor) -> Tensor:
 
 
 def choices(known: Sequence[Part]) -> dict[str, Part]:
-    """The parts that Gaussians can become, by their names on the page: those that there are, and one of each role."""
+    """The parts on offer, by their names on the page: existing ones, and one of each role."""
     found = {part.name if part.name == part.role else f"{part.name} ({part.role})": part for part in known}
     names = {part.name for part in known}
     return found | {role: Part(role, role) for role in ROLES if role not in names}

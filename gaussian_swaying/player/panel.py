@@ -38,7 +38,7 @@ LIGHT = "shader.init_args.light"
 
 
 def slider(name: str, value: float, label: str = "") -> dict[str, Any]:
-    """The control of a number of the model: a slider between its ends, or a field where these are far away."""
+    """A control for a number of the model: a slider, or a field where the range is wide."""
     known = number(name)
     low, high = ENDS.get(name, (known.low, known.high))
     log = known.scale == "log" and (low > 0 or (name not in ENDS and value > 0))
@@ -85,7 +85,6 @@ class Panel:
         }
 
     def groups(self) -> list[dict[str, Any]]:
-        """All controls with their values, in groups, for JSON."""
         settings, model = self.session.settings, self.session.simulation.model
         flow = self._flow()
         speed, *angles = angles_of(flow)
@@ -132,7 +131,6 @@ class Panel:
         return [*found, group("Picture", picture, True)]
 
     def names(self) -> dict[str, dict[str, Any]]:
-        """The controls by their names."""
         return {control["name"]: control for part in self.groups() for control in part["controls"]}
 
     def set(self, name: str, value: Any) -> None:
@@ -165,7 +163,7 @@ class Panel:
             self.session.change(self._own[name](value))
 
     def legends(self) -> dict[str, dict[str, Any]]:
-        """The colour scales of pictures: name, unit, largest value and colours from zero to it, by pass."""
+        """Colour scales of the passes: name, unit, largest value, and colours from zero to it."""
         stepper = self.session.simulation.stepper
         colours = (255 * colormap(torch.linspace(0, 1, 9, dtype=torch.float64))).round().int().tolist()
         scales = {

@@ -27,7 +27,7 @@ FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))  # to a 
 
 @dataclass(frozen=True)
 class Eye:
-    """How a browser looks at the scene.
+    """The view of a browser.
 
     Attributes:
         matrix: From the axes of its camera, y up and z backwards, to those of a film, float64, shape (4, 4).
@@ -43,7 +43,7 @@ class Eye:
 
     @classmethod
     def told(cls, message: Mapping[str, Any]) -> Eye:
-        """From a message with ``matrix`` (column by column), ``fov`` [degrees], ``near`` and ``size``."""
+        """Parse a message with ``matrix`` (column by column), ``fov`` [degrees], ``near`` and ``size``."""
         matrix = torch.tensor(message["matrix"], dtype=torch.float64).reshape(4, 4).T
         fov, near = math.radians(message["fov"]), float(message["near"])
         width, height = (int(side) for side in message["size"])
@@ -89,7 +89,7 @@ def draw(
 
 @torch.inference_mode()
 def under_cursor(snapshot: Snapshot, origin: Sequence[float], direction: Sequence[float]) -> list[float] | None:
-    """The place of the first Gaussian that a ray meets [scene units]; None if it meets nothing that can be seen.
+    """Position of the first visible Gaussian on a ray [scene units]; None if there is none.
 
     Args:
         origin: Start of the ray [scene units].
@@ -114,7 +114,7 @@ def under_cursor(snapshot: Snapshot, origin: Sequence[float], direction: Sequenc
 
 
 class PictureSize:
-    """Chooses the size of pictures so that drawing one takes about as long as it may.
+    """Adapts the size of pictures to the time that drawing may take.
 
     Args:
         seconds: Time that a picture may take [s].
@@ -126,7 +126,7 @@ class PictureSize:
         self.seconds, self.largest, self._level = seconds, largest, level
 
     def fit(self, width: int, height: int, still: bool = False) -> tuple[int, int]:
-        """Size for a window of these pixels; the same shape, and even. If nothing moves, as large as it may be."""
+        """Even size for a window, with its aspect ratio; the largest if nothing moves."""
         width, height = max(width, 1), max(height, 1)
         largest = min(1.0, self.largest / max(width, height))
         scale = largest if still else largest * SIZES[self._level]

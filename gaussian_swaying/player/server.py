@@ -109,7 +109,7 @@ class Door:
 
 
 def drawable(snapshot: Snapshot) -> bool:
-    """True if a browser can draw a snapshot: the Gaussians follow nodes, in a light that it knows."""
+    """True if a browser can draw a snapshot itself: its Gaussians follow nodes, and it knows the light."""
     shader = snapshot.simulation.painter.shader
     with turn(snapshot.simulation):
         has_nodes = snapshot.simulation.scene.follow.nodes(snapshot.state) is not None
@@ -118,13 +118,12 @@ def drawable(snapshot: Snapshot) -> bool:
 
 @torch.inference_mode()
 def colour_message(simulation: Simulation, film: Film, roles: Tensor, known: Tensor) -> bytes | None:
-    """Other colours of the Gaussians whose role has changed; None if there are none.
+    """New colours of the Gaussians whose role has changed; None if there are none.
 
     Their places in the film (uint32), and red, green and blue of each (uint8).
 
     Args:
         roles: Their roles in the splat, see :func:`~gaussian_swaying.rendering.tints.by_role`, shape (N,).
-        known: The same before.
     """
     order = torch.from_numpy(film.order)
     place = (roles != known)[order].nonzero()[:, 0]
@@ -141,11 +140,7 @@ def colour_message(simulation: Simulation, film: Film, roles: Tensor, known: Ten
 
 @torch.inference_mode()
 def state_message(snapshot: Snapshot, ended: bool) -> bytes:
-    """The displacement of the nodes of a state: 6 bytes each, and 16 more for one that moved far.
-
-    Args:
-        ended: Whether no other state follows for now.
-    """
+    """Nodal displacements of a state: 6 bytes per node, and 16 more for one that moved far."""
     simulation, scene = snapshot.simulation, snapshot.simulation.scene
     with turn(simulation):
         moved = scene.follow.nodal(snapshot.state)
@@ -159,7 +154,7 @@ def state_message(snapshot: Snapshot, ended: bool) -> bytes:
 
 
 def turn(simulation: Simulation) -> AbstractContextManager[None]:
-    """On a GPU the turn of the thread that reads it, as another may record a graph; a CPU does not have to wait."""
+    """The lock for reading a simulation on a GPU, where another thread may be recording a graph; no lock on a CPU."""
     return simulation.turn if simulation.device.type == "cuda" else nullcontext()
 
 
@@ -194,16 +189,14 @@ class Client:
 
     @property
     def rate(self) -> float:
-        """Pictures that it shows a second, as it said within the last seconds."""
         rate, said = self._rate
         return rate if time.monotonic() - said < RECENT else 0.0
 
     def confirm(self, count: int, rate: float) -> None:
-        """It has taken in so many messages with bytes, and shows so many pictures a second."""
+        """Note that the browser has taken in ``count`` messages, and its picture rate."""
         self._taken, self._rate = int(count), (min(max(float(rate), 0.0), 1000.0), time.monotonic())
 
     async def say(self, told: Mapping[str, Any] | bytes) -> None:
-        """Send a message; one with bytes is to be confirmed."""
         self._sent += isinstance(told, bytes)
         if isinstance(told, bytes):
             await self.connection.send_bytes(told)
@@ -263,7 +256,6 @@ class Server:
     # ---- from any thread
 
     def show(self, session: Session) -> Server:
-        """Show a session; returns the server."""
         self.panel, self.painting = Panel(session), Painting(session, self.scratch)
         self.session = session
         self.progress(None)
@@ -271,7 +263,7 @@ class Server:
         return self
 
     def progress(self, share: float | None, what: str = "") -> None:
-        """Show how much of something is done, from 0 to 1; None if there is nothing to wait for."""
+        """Show a progress bar from 0 to 1; None removes it."""
         self._progress = None if share is None else {"share": share, "what": what}
 
     def tell(self, notice: str, seconds: float = 15.0) -> None:
@@ -343,7 +335,6 @@ class Server:
             await runner.cleanup()
 
     def _follow(self) -> None:
-        """Wake the browsers after each step."""
         assert self.session is not None
         number = -1
         while not self._closing.is_set():
@@ -375,7 +366,6 @@ class Server:
         return answer
 
     async def _head(self, request: web.Request, response: web.StreamResponse) -> None:
-        """Headers that forbid frames and connections elsewhere."""
         own = request.headers.get("Host", "")
         response.headers["Content-Security-Policy"] = (
             f"frame-ancestors 'none'; connect-src 'self' ws://{own} wss://{own} blob: data:"
@@ -420,7 +410,6 @@ class Server:
         return self.painting.saved(self.scratch / FILE)
 
     async def _load(self, request: web.Request) -> web.Response:
-        """Load a splat or a configuration; of its name only the ending is used."""
         ending = Path(request.query.get("name", "")).suffix.lower()
         kinds = [own for format in FORMATS.values() if format.read for own in format.endings]
         configured = ending in (".yaml", ".yml")
@@ -464,7 +453,6 @@ class Server:
         return settings_of_splat(self.session.parser, path, device, path.parent, tell=self.progress, quick=quick)
 
     def _read_configuration(self, path: Path) -> Namespace:
-        """The settings in a configuration; if its splat is not on this computer, they get the present one."""
         assert self.session is not None
         self.progress(0.1, "Reading the configuration")
         try:
@@ -503,7 +491,6 @@ class Server:
         return connection
 
     async def _hear(self, client: Client, said: dict[str, Any]) -> None:
-        """Do what a browser asks for."""
         kind, session = said["kind"], self.session
         if kind == "ack":
             client.confirm(said["count"], said["rate"])
@@ -539,7 +526,6 @@ class Server:
         return await self._loop.run_in_executor(self._work, partial(what, *given))
 
     def _place(self, metres: Sequence[float]) -> list[float]:
-        """A place in scene units."""
         assert self.session is not None
         place = torch.tensor(metres, dtype=torch.float64)
         if place.shape != (3,) or not bool(place.isfinite().all()):
@@ -566,7 +552,6 @@ class Server:
     # ---- what it gets
 
     async def _feed(self, client: Client) -> None:
-        """Send a browser what is new until it is gone."""
         while True:
             with suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(client.wake.wait(), TOLD_EVERY)
@@ -590,7 +575,6 @@ class Server:
             await asyncio.sleep(max(1 / MOST_PER_SECOND - (self._loop.time() - began), 0))
 
     def _news(self) -> dict[str, Any]:
-        """Controls and figures, the same for all browsers."""
         now = time.monotonic()
         settings = None if self.session is None else self.session.settings
         if now - self._texts[0] < TOLD_EVERY and settings is self._texts[1]:
@@ -618,7 +602,6 @@ class Server:
         return found
 
     async def _send(self, client: Client, session: Session) -> None:
-        """Send what a browser lacks of the newest snapshot: the scene, light, colours, and the state, or a picture."""
         snapshot, still = session.snapshot, session.paused or session.broken
         if client.show != "color" or client.server or not drawable(snapshot):
             await self._send_picture(client, session, snapshot, still)

@@ -46,7 +46,7 @@ SHADER = "shader.init_args."
 
 
 def changed_settings(parser: ArgumentParser, settings: Namespace, values: Mapping[str, Any]) -> Namespace:
-    """Settings with other values. Parameters are checked and set; only other fields are parsed anew.
+    """Settings with other values. Parameters are set directly; other fields are parsed anew.
 
     Args:
         values: New values by the names of their fields, with dots, or of parameters.
@@ -80,7 +80,7 @@ def take(simulation: Simulation, parser: ArgumentParser, settings: Namespace, va
     material only if it is the same everywhere.
 
     Returns:
-        False if another field has changed, so that the simulation has to be made anew.
+        False if the simulation must be made anew.
     """
     numbers = {name: value for name, value in values.items() if find(name) is not None}
     heads = {name.split(".")[0] for name in values if name not in numbers}
@@ -154,12 +154,12 @@ class Pull(Force):
         return cls(share, mass, position - mean, mean, scene.frame)
 
     def aim(self, place: Sequence[float]) -> None:
-        """Set where it pulls to [scene units]."""
+        """Set the target [scene units]."""
         target = self._frame.point_to_sim(torch.tensor(list(place), dtype=torch.float64))
         self.target.copy_(target.to(self.target))
 
     def device_function(self) -> DeviceFunction:
-        """The pull of the package's kernels."""
+        """The device function of :mod:`~gaussian_swaying.mpm.pull`."""
         return pull(
             lambda: torch.cat([self.offset, self.held[:, None]], -1),
             lambda time, dt, steps: self.target.expand(steps, 3),
@@ -236,7 +236,7 @@ def settings_of_splat(
 
 
 def share_cores() -> None:
-    """Give threads that start from now on half of the cores: one simulates and one draws, on a CPU."""
+    """Limit threads started from now on to half of the cores: on a CPU one simulates and one draws."""
     torch.set_num_threads(max(1, torch.get_num_threads() // 2))
 
 
@@ -338,11 +338,11 @@ class Session:
         self._ask(self._reset)
 
     def undo(self) -> None:
-        """Take the last change back, or :meth:`restore`; the motion goes on if it did with the change."""
+        """Undo the last change or :meth:`restore`. The motion goes on if the change did not stop it."""
         self._ask(self._undo)
 
     def restore(self) -> None:
-        """Go back to rest and to the settings of the start, or of the scene that was loaded: pins, material, all."""
+        """Go back to rest, with the settings of the start or of the loaded scene."""
         self._ask(self._restore)
 
     @property
@@ -350,7 +350,7 @@ class Session:
         return len(self._past)
 
     def reachable(self) -> list[Namespace]:
-        """The settings now, and all to which :meth:`undo` and :meth:`restore` can go back."""
+        """All settings that :meth:`undo` and :meth:`restore` can reach, and the current ones."""
         return [self.settings, self._first, *(past.settings for past in list(self._past))]
 
     def pause(self, paused: bool = True) -> None:
@@ -372,7 +372,7 @@ class Session:
         self._ask(lambda: self._grab(place))
 
     def drag(self, place: Sequence[float]) -> None:
-        """Pull the grabbed material towards a place [scene units]; of several before the next step the last counts."""
+        """Move the target of the grab [scene units]; before the next step the last call counts."""
         with self._wake:
             self._aim = place
             self._wake.notify_all()
@@ -400,7 +400,6 @@ class Session:
         return config_text(self.parser, self.settings)
 
     def rate(self) -> float:
-        """Simulated seconds per second, lately."""
         steps, now = list(self._steps), time.perf_counter()
         steps = [step for step in steps if now - step[0] < WINDOW]
         if len(steps) < 2:
@@ -453,7 +452,6 @@ class Session:
             self.revision += 1
 
     def _advance(self, single: bool) -> None:
-        """One step, then wait until its time has come."""
         simulation, began = self.simulation, time.perf_counter()
         try:
             with torch.inference_mode():
@@ -497,7 +495,6 @@ class Session:
                 self._wake.wait_for(lambda: self._closed or self._busy(), due - now)
 
     def pace(self, speed: float) -> None:
-        """Set the wanted speed, in simulated seconds per second."""
         with self._wake:
             self.speed, self._anchor = max(float(speed), 1e-3), None
 
@@ -554,7 +551,6 @@ class Session:
         self.revision += 1
 
     def _take_settings(self, settings: Namespace, fresh: bool = False) -> None:
-        """Make the simulation anew; unless ``fresh``, it goes on from where it is if its nodes stay the same."""
         simulation = _drawn_roughly(Simulation.from_settings(self.parser, settings))
         start = simulation.start()
         state = None  # goes on only between solvers that can
@@ -580,7 +576,6 @@ class Session:
 
 
 def _drawn_roughly(simulation: Simulation) -> Simulation:
-    """A simulation of which a renderer on a CPU thins Gaussians that are much smaller than a pixel."""
     simulation.painter.renderer = make_renderer(simulation.device, detail=DETAIL)
     return simulation
 
@@ -630,7 +625,7 @@ def in_real_time(parser: ArgumentParser, settings: Namespace, simulation: Simula
 def finest_within(
     cost: Callable[[float], float], wish: float, configured: float, coarsest: float = math.inf
 ) -> tuple[float, dict[float, float]]:
-    """The finest grid of a few that are tried whose cost is at most a wish, or that of least cost; and all costs.
+    """The finest trial grid whose cost is within a limit, or else the cheapest one; with all costs.
 
     Args:
         cost: Cost for a grid spacing [m]; ValueError where the grid is too coarse for the scene, such as for a pin.
@@ -667,12 +662,11 @@ def _predicted(tried: Mapping[float, float], wish: float, finest: float, coarses
 
 
 def sentence(configured: float, chosen: float, configured_speed: float, speed: float) -> str:
-    """Says which grid was chosen, and how to get the configured one.
+    """A sentence that names the chosen grid, and how to get the configured one.
 
     Args:
         configured: Its spacing [m].
         chosen: Spacing of the grid that was chosen [m].
-        configured_speed: Simulated seconds per second on the configured grid.
     """
     fast = f"predicted to run at {speed:.2g} x real time here"
     if chosen == configured:

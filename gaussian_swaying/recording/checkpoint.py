@@ -12,7 +12,7 @@ from gaussian_swaying.runs.saved import load_plain
 
 
 def log_lines(log: Sequence[Mapping[str, float]], known: list[str]) -> list[str]:
-    """A log of frames as a checkpoint stores it: a line of JSON per frame.
+    """Extend ``known``, a log as JSON lines, by the new entries of ``log``.
 
     Returns:
         A copy of ``known``.
@@ -26,9 +26,6 @@ def read_checkpoint(path: Path, config: str = "") -> dict[str, Any]:
 
     Args:
         config: The configuration with which it must have been written; "" for any.
-
-    Returns:
-        Its fields.
     """
     if not path.exists():
         raise ValueError(f"There is nothing to resume in {path.parent}: it has no {path.name}; leave out --resume.")

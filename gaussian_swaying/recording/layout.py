@@ -18,11 +18,7 @@ def names() -> list[str]:
 
 
 def frame_folder(render: str = "color", camera: str = "") -> str:
-    """Folder of a render's frames inside that of the run: ``frames``, ``depth``, ``cameras/<name>/frames`` ...
-
-    Args:
-        camera: Name of a further camera; empty for the main camera.
-    """
+    """Folder of a render's frames inside that of the run: ``frames``, ``depth``, ``cameras/<name>/frames`` ..."""
     own = "frames" if render == "color" else render
     return f"cameras/{camera}/{own}" if camera else own
 

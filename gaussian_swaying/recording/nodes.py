@@ -67,7 +67,6 @@ def load_nodes(path: str | os.PathLike[str]) -> Tensor:
 
 
 def _joined(near: np.ndarray, far: np.ndarray) -> np.ndarray:
-    """:func:`join_far` of arrays from a file."""
     for array, (shape, kind) in zip((near, far), NODES.values(), strict=True):
         if array.dtype != kind or array.shape[1:] != shape:
             raise ValueError(f"an array of {array.dtype} has the shape {array.shape}")

@@ -215,7 +215,6 @@ class Recorder:
         return checkpoint
 
     def _continue(self, path: Path, config: str, check: Callable[[dict[str, Any]], None] | None) -> dict[str, Any]:
-        """Lock the folder and check everything that the rest of the run needs, before anything is changed."""
         if not path.is_dir():
             raise ValueError(f"There is nothing to resume in {path}: it has no checkpoint.pt; leave out --resume.")
         self._lock = hold_folder(path, "check its permissions")
@@ -296,7 +295,7 @@ class Recorder:
             self._submit(encoder.path, encode)
 
     def told(self) -> list[str]:
-        """A sentence for each folder of pictures in which some show nothing; of those written so far."""
+        """A sentence for each folder with blank pictures, of those written so far."""
         found = {place: sorted(index for other, index in self._blank if other == place) for place, _ in self._blank}
         return [
             f"{len(frames)} pictures in {place} show nothing, the first in frame {frames[0]}: check `near` and the "
@@ -415,7 +414,6 @@ class Recorder:
         return made
 
     def _finish_video(self, place: str, files: list[Path]) -> None:
-        """Finish the video if it has these frames, or else encode the files."""
         film = self._films[place]
         encoder = film.encoder
         if encoder is not None and film.encoded == [int(file.stem) for file in files]:

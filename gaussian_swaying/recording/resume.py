@@ -10,7 +10,7 @@ from gaussian_swaying._inputs import check_archive
 
 
 def packed_frames(path: Path) -> set[int]:
-    """The frames whose arrays were joined into a file, such as ``trajectory.npz``, if there is one."""
+    """Frames already packed into a file such as ``trajectory.npz``."""
     if not path.exists():
         return set()
     with zipfile.ZipFile(check_archive(path, "the run")) as archive:
@@ -18,11 +18,7 @@ def packed_frames(path: Path) -> set[int]:
 
 
 def tell_missing(folder: Path, suffix: str, frames: Iterable[int], film: str | None = None) -> list[str]:
-    """A sentence if files of frames are missing.
-
-    Args:
-        film: Name of the file made from them, if any.
-    """
+    """A sentence if files of frames are missing."""
     paths = (folder / f"{index:05d}{suffix}" for index in sorted(frames))
     files = [path for path in paths if not path.exists()]
     if not files:

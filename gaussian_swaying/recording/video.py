@@ -58,7 +58,6 @@ class VideoEncoder:
             raise self._failure() from None
 
     def finish(self) -> None:
-        """Wait for ffmpeg and rename the file; without frames there is no file."""
         if self._process is None:
             return
         assert self._process.stdin is not None
@@ -70,7 +69,6 @@ class VideoEncoder:
         self.abort()
 
     def abort(self) -> None:
-        """Stop, and remove an unfinished file; no more frames are accepted."""
         with self._lock:
             self._closed = True
         self._end()
@@ -110,9 +108,7 @@ def encode_video(frames: list[Path], path: Path, fps: float) -> None:
     """Encode images with :class:`VideoEncoder`.
 
     Args:
-        frames: PNG files in order.
         path: The .mp4 file.
-        fps: Frames per second.
     """
     import imageio.v3 as iio
 

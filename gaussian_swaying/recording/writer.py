@@ -108,7 +108,6 @@ class FrameWriter:
         Args:
             name: Name of its file. Jobs with the same name run one after the other, in the order of submission.
             run: The job. It gets no arguments; its data must not change.
-            after_all: Start only when everything submitted before is done.
         """
         with self._changed:
             while len(self._jobs) >= self.limit and self._error is None:
@@ -121,7 +120,6 @@ class FrameWriter:
             self._hire()
 
     def wait(self) -> None:
-        """Wait until no job is pending."""
         with self._changed:
             while self._jobs:
                 self._hire()

@@ -33,7 +33,7 @@ class Seen:
 
 
 def seen(means: Tensor, covariances: Tensor, camera: Camera, picture: RenderOutput, slack: float = 0.0) -> Seen:
-    """Gaussians on a screen: their places, and which of them the drawn surface does not hide.
+    """Project Gaussians to the screen, and mark those that the drawn surface does not hide.
 
     A Gaussian is hidden if it lies behind the depth at the pixel of its centre, by more than a slack and two standard
     deviations of its own. These are taken along the line of sight, and across it times the slope of the depth, as the
@@ -41,13 +41,9 @@ def seen(means: Tensor, covariances: Tensor, camera: Camera, picture: RenderOutp
     nothing.
 
     Args:
-        means: Centres [scene units], shape (N, 3).
         covariances: Their covariances [scene units²], shape (N, 3, 3).
         picture: A picture of them from there, which may have fewer pixels.
         slack: See there [scene units].
-
-    Returns:
-        All on the CPU.
     """
     pixel, depth = project(means, camera)
     size = torch.tensor([camera.width, camera.height])
@@ -85,7 +81,7 @@ def _slope(depth: Tensor) -> Tensor:
 
 
 def touched(view: Seen, path: Tensor, radius: float, through: bool = False) -> Tensor:
-    """The Gaussians whose centres a brush touches that follows a path, their indices, rising, int64, shape (M,).
+    """Indices of Gaussians whose centres a brush touches along a path, rising, int64, shape (M,).
 
     Args:
         path: Corners of the path [pixels], shape (S, 2); the brush goes straight from one to the next.

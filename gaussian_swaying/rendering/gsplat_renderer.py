@@ -85,7 +85,7 @@ _LOADING = threading.Lock()
 
 
 def loaded_before() -> bool:
-    """True if :func:`load_kernels` finds kernels that it has loaded before, so that it takes a moment."""
+    """True if :func:`load_kernels` will load cached kernels, which takes a moment."""
     folder = build_folder()
     try:
         return (folder / "gsplat_cuda.stamp").read_text(encoding="utf-8") == _stamp(folder / "gsplat_cuda.so")
@@ -94,7 +94,7 @@ def loaded_before() -> bool:
 
 
 def build_folder() -> Path:
-    """The folder in which torch compiles the kernels of gsplat; its own function for it takes long to import."""
+    """Build folder of gsplat's kernels; torch's own function for it is slow to import."""
     root = os.environ.get("TORCH_EXTENSIONS_DIR")
     if root is None:
         python = f"py{sys.version_info.major}{sys.version_info.minor}{getattr(sys, 'abiflags', '')}"
@@ -105,7 +105,6 @@ def build_folder() -> Path:
 
 
 def _stamp(library: Path) -> str:
-    """All that a library of gsplat's kernels was compiled from, and its size and time."""
     from importlib.metadata import version
 
     found = importlib.util.find_spec("gsplat")
@@ -149,11 +148,6 @@ def render_gsplat(
 
     Args:
         means: Centres [scene units], on a CUDA device, shape (N, 3).
-        covariances: Symmetric covariances [scene units^2], shape (N, 3, 3).
-        opacities: Opacities in [0, 1], shape (N,).
-        colors: Colours as displayed, shape (N, 3).
-        background: Colour behind the Gaussians, shape (3,); black when None.
-        eps2d: Added to the diagonal of the projected covariances [pixels^2].
 
     Returns:
         The picture, in the precision of ``means``.
@@ -213,12 +207,8 @@ def rasterize_splat(
 
     Args:
         means: Centres [scene units], float32 on a CUDA device, shape (N, 3).
-        quats: Quaternions (w, x, y, z) of any length, shape (N, 4).
         scales: Standard deviations [scene units], shape (N, 3).
-        opacities: Opacities in [0, 1], shape (N,).
         sh: Coefficients of real spherical harmonics, shape (N, K, 3).
-        background: Colour behind the Gaussians, shape (3,); black when None.
-        eps2d: Added to the diagonal of the projected covariances [pixels^2].
         channels: Further values to blend behind the colours, over zero, shape (N, E).
 
     Returns:

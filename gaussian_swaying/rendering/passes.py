@@ -94,7 +94,6 @@ def scalar_colors(blended: Tensor, alpha: Tensor, largest: float, smooth: bool =
     Args:
         blended: Blended values, shape (H, W).
         alpha: Opacity, shape (H, W, 1).
-        largest: End of the scale, in the unit of the values.
         smooth: Whether edges fade to black instead of ending at a pixel.
 
     Returns:

@@ -42,11 +42,6 @@ class SurfaceMaps:
 def plane_channels(means: Tensor, quats: Tensor, log_scales: Tensor, camera: Camera) -> Tensor:
     """Return the channels that are blended for :func:`surface_maps`: normal towards the camera, distance of the plane.
 
-    Args:
-        means: Centres [scene units], shape (N, 3).
-        quats: Quaternions wxyz of any length above zero, shape (N, 4).
-        log_scales: Logarithm of the standard deviations [scene units], shape (N, 3).
-
     Returns:
         Normals in the frame of the camera and n.x, shape (N, 4). Differentiable in ``means`` and ``quats``.
     """
@@ -76,10 +71,6 @@ def surface_maps(channels: Tensor, alpha: Tensor, camera: Camera, least_alpha: f
     Args:
         channels: Blended channels, shape (H, W, 4).
         alpha: Rendered opacity, shape (H, W, 1).
-        least_alpha: A pixel with less opacity shows no surface.
-
-    Returns:
-        The maps, differentiable where a surface is.
     """
     check_shape("channels", channels, camera.height, camera.width, 4)
     check_shape("alpha", alpha, camera.height, camera.width, 1)

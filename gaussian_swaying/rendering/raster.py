@@ -34,7 +34,7 @@ MOST_PAIRS = 1 << 28
 
 
 def runs(tensors: Iterable[Tensor]) -> bool:
-    """True if :func:`render` can draw from some tensors: float32 on a CPU, and none wants a gradient."""
+    """True if :func:`render` supports these tensors: float32 on a CPU, without gradients."""
     if INTERPRETED or not compiles("cpu"):
         return False
     return all(
@@ -60,12 +60,6 @@ def render(
     The same bits for any number of threads.
 
     Args:
-        means: Centres [scene units], shape (N, 3).
-        covariances: Symmetric covariances [scene units^2], shape (N, 3, 3).
-        opacities: Opacities in [0, 1], shape (N,).
-        colors: Colours as displayed, shape (N, 3).
-        background: Colour behind the Gaussians, shape (3,); black when None.
-        eps2d: Added to the diagonal of the projected covariances [pixels^2].
         detail: Size below which Gaussians are thinned [pixels]; 0 for none.
 
     Returns:

@@ -66,7 +66,7 @@ def _eighth_power(x):
 def project(
     means, covariances, opacities, colors, camera, rows, wide, depths, boxes, count, width, height, BLOCK: tl.constexpr
 ):
-    """One Gaussian per lane: its row, its depth (infinite if it is not drawn), its box of tiles (first and last).
+    """One Gaussian per lane: its row, its depth (infinite if not drawn) and its box of tiles (first and last).
 
     ``camera`` has its two matrices, near plane, blur and square of the detail, float64; ``wide`` are the rows as
     float64.
@@ -169,7 +169,7 @@ def count_pairs(order, boxes, counts, count, across, tiles):
 
 @triton.jit
 def list_pairs(order, boxes, starts, pairs, count, across, tiles):
-    """As :func:`count_pairs`: the Gaussians of each tile, from where ``starts`` (chunks, tiles) says; it moves on."""
+    """As :func:`count_pairs`, but writes the Gaussians of each tile from ``starts`` (chunks, tiles) on."""
     chunk = tl.program_id(0)
     chunks = tl.num_programs(0)
     own = starts + chunk * tiles

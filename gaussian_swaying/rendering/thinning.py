@@ -27,7 +27,7 @@ def thinned(
     detail: float = DETAIL,
     eps2d: float = 0.3,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    r"""Some of the Gaussians, which look like all of them.
+    r"""A random subset of the Gaussians that looks like all of them.
 
     The projected size s of a Gaussian is the root of the Frobenius norm of its covariance, times focal length per
     depth; no standard deviation of its projection is larger, but for the perspective at the border. Of those with s
@@ -41,12 +41,8 @@ def thinned(
     and its opacity o becomes :math:`1 - (1 - o)^{1 / (q g)}`: the optical depth, times the area, is that of all.
 
     Args:
-        means: Centres [scene units], shape (N, 3).
-        covariances: Symmetric covariances [scene units^2], shape (N, 3, 3).
-        opacities: Opacities in [0, 1], shape (N,).
         colors: Colours, shape (N, 3).
         detail: The size d [pixels].
-        eps2d: Added to the diagonal of the projected covariances [pixels^2].
 
     Returns:
         Centres, covariances, opacities and colours of the M Gaussians to be drawn.

@@ -16,24 +16,23 @@ TINTS = {"held": HELD, "rigid": RIGID, "hidden": (20, 20, 20)}
 
 
 def tinted(colours: Tensor, tint: Sequence[int], share: float = 0.7) -> Tensor:
-    """Colours with a share of another one.
+    """Mix a tint into colours.
 
     Args:
         colours: From 0 to 1, shape (N, 3).
         tint: The other colour, from 0 to 255.
-        share: Its share.
     """
     target = torch.tensor(tint, dtype=colours.dtype, device=colours.device) / 255
     return (1 - share) * colours + share * target
 
 
 def greyed(colours: Tensor) -> Tensor:
-    """Colours (N, 3) without their hue, and pale."""
+    """Colours (N, 3) desaturated and paled."""
     return 0.5 + 0.4 * colours.mean(-1, keepdim=True).expand_as(colours)
 
 
 def by_role(colours: Tensor, roles: Tensor) -> Tensor:
-    """Colours with the tints of roles.
+    """Tint colours by role.
 
     Args:
         colours: From 0 to 1, shape (N, 3).

@@ -68,12 +68,6 @@ def project_gaussians(
     1/255, or if the ellipse where its alpha reaches 1/255 is outside the image. That ellipse has
     :math:`\sqrt{2 \ln(255\,o)} \le 3.33` standard deviations (Radl et al. 2024, arXiv 2402.00525, appendix B.2).
 
-    Args:
-        means: Centres [scene units], shape (N, 3).
-        covariances: Symmetric covariances [scene units^2], shape (N, 3, 3).
-        opacities: Opacities in [0, 1], shape (N,).
-        eps2d: Added to the diagonal of the projected covariances [pixels^2].
-
     Returns:
         The V remaining Gaussians, sorted by depth; Gaussians of equal depth keep their order.
     """
@@ -122,7 +116,6 @@ def _extent(covariances2d: Tensor, log_opacities: Tensor) -> Tensor:
 
 
 def _blocks(counts: Tensor, limit: int) -> tuple[Tensor, list[tuple[int, int]]]:
-    """Split consecutive items into blocks whose counts sum to about ``limit``."""
     running = counts.cumsum(0)
     total = int(running[-1]) if len(running) else 0
     marks = torch.arange(limit, total + limit, limit, device=counts.device)
@@ -199,8 +192,6 @@ def composite_gaussians(
 
     Args:
         features: Values to blend, shape (V, D).
-        width: Image width [pixels].
-        height: Image height [pixels].
         max_pairs: Approximate number of pairs of a Gaussian and a pixel in memory at a time (autograd keeps them all).
 
     Returns:
@@ -270,12 +261,6 @@ def render_torch(
     Differentiable with respect to ``means``, ``covariances``, ``opacities``, ``colors`` and ``background``.
 
     Args:
-        means: Centres [scene units], shape (N, 3).
-        covariances: Symmetric covariances [scene units^2], shape (N, 3, 3).
-        opacities: Opacities in [0, 1], shape (N,).
-        colors: Colours as displayed, shape (N, 3).
-        background: Colour behind the Gaussians, shape (3,); black when None.
-        eps2d: Added to the diagonal of the projected covariances [pixels^2].
         max_pairs: Approximate number of pairs of a Gaussian and a pixel in memory at a time.
 
     Returns:

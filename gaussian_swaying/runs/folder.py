@@ -75,7 +75,6 @@ def _resolve(folder: Path) -> Path:
 
 
 def _as_named(folder: Path, aside: Path) -> Path:
-    """Return the present path of an earlier run, relative if the folder was given as a relative path."""
     beside = not folder.is_symlink() and folder.name == aside.name.rpartition(".")[0]
     return folder.with_name(aside.name) if beside else aside
 

@@ -48,7 +48,6 @@ class FolderLock:
         self._place[0] = folder
 
     def release(self) -> None:
-        """Unlock the folder; a second call does nothing."""
         self._end()
 
 

@@ -14,7 +14,7 @@ from gaussian_swaying._files import atomic
 
 
 def save_whole(path: Path, value: Any) -> None:
-    """Write what ``torch.load`` reads, whole or not at all."""
+    """Save tensors for ``torch.load``, whole or not at all."""
     try:
         with atomic(path) as temporary:
             torch.save(value, temporary)

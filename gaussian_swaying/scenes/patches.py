@@ -70,7 +70,7 @@ def join(parts: Sequence[Patches]) -> Patches:
 
 
 def baked(patches: Patches, ambient: float, two_sided: bool) -> Tensor:
-    """Colours (N, 3) under the light of :data:`LIGHT`: ``colour (ambient + (1 - ambient) max(0, n L))``."""
+    """Lit colours (N, 3): ``colour (ambient + (1 - ambient) max(0, n L))`` with :data:`LIGHT`."""
     light = torch.tensor(LIGHT, dtype=torch.float64)
     cosine = patches.normal @ (light / light.norm())
     lit = cosine.abs() if two_sided else cosine.clamp_min(0)
@@ -117,9 +117,6 @@ def quads(corners: Tensor, colour: Sequence[float] = (0.8, 0.8, 0.8)) -> Patches
     Args:
         corners: Corners [m], shape (R, 2, C + 1, 3): lower and upper edge of each row of C quadrilaterals.
         colour: RGB in [0, 1].
-
-    Returns:
-        R x C patches, row by row.
     """
     low, high = corners[:, 0], corners[:, 1]
     center = 0.25 * (low[:, 1:] + low[:, :-1] + high[:, 1:] + high[:, :-1])
@@ -136,9 +133,6 @@ def sheet(
     Args:
         surface: Point (..., 3) of v and u, both in [0, 1] of shape (...). The outside is on the side of du x dv.
         colour: RGB in [0, 1].
-
-    Returns:
-        rows x columns patches.
     """
     v = torch.linspace(0, 1, rows + 1, dtype=torch.float64)
     u = torch.linspace(0, 1, columns + 1, dtype=torch.float64)
@@ -182,9 +176,6 @@ def tube(
         radius: Radius at these points [m], shape (K,).
         spacing: Distance between Gaussians [m].
         colour: RGB in [0, 1].
-
-    Returns:
-        The patches, ring by ring.
     """
     line = torch.as_tensor(path, dtype=torch.float64)
     line = torch.cat([line, torch.as_tensor(radius, dtype=torch.float64)[:, None]], dim=-1)
@@ -211,9 +202,6 @@ def revolution(
         profile: Radius and height [m], shape (K, 2). The outside is to the right of the direction of the profile.
         spacing: Distance between Gaussians [m].
         colour: RGB in [0, 1].
-
-    Returns:
-        The patches, ring by ring.
     """
     line = torch.as_tensor(profile, dtype=torch.float64)
     length = float(torch.linalg.vector_norm(line[1:] - line[:-1], dim=-1).sum())
@@ -278,9 +266,6 @@ def copies(template: Patches, axes: Tensor, size: Tensor, origin: Tensor, tint: 
         size: Factor on its lengths, shape (M,).
         origin: Position of each copy's origin [m], shape (M, 3).
         tint: Factor on its colours, shape (M, 3).
-
-    Returns:
-        M x T patches, copy by copy.
     """
     turn = axes * size[:, None, None]
 
@@ -298,7 +283,7 @@ def copies(template: Patches, axes: Tensor, size: Tensor, origin: Tensor, tint: 
 
 
 def facing(direction: Tensor, up: Tensor) -> Tensor:
-    """Rotations (M, 3, 3) that take y to a direction (M, 3) and z as near to ``up`` (M, 3) as possible."""
+    """Rotations (M, 3, 3) that take y to a direction (M, 3), with z as close to ``up`` (M, 3) as possible."""
     y = torch.nn.functional.normalize(direction, dim=-1)
     x = torch.nn.functional.normalize(torch.linalg.cross(y, up), dim=-1)
     return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)

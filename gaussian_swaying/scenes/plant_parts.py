@@ -48,9 +48,6 @@ def leaf(
         spacing: Distance between Gaussians [m]; a leaf has at least one Gaussian.
         droop: Distance of the tip below the plane, as a share of the length.
         fold: Height of the rim above the midrib, as a share of the half width.
-
-    Returns:
-        The patches, row by row.
     """
     p, q = taper
     fine = torch.linspace(0, 1, 513, dtype=torch.float64)

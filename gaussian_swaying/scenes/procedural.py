@@ -44,7 +44,7 @@ class ProceduralScene(Fixed, ABC):
 
 
 def both(first: GaussianCloud, second: GaussianCloud) -> GaussianCloud:
-    """Two splats as one, with the normals of both."""
+    """Two splats joined, with both normals."""
     parts = [
         replace(part, normals=smallest_axis_normal(part.quats, part.scales)) if part.normals is None else part
         for part in (first, second)
@@ -54,7 +54,7 @@ def both(first: GaussianCloud, second: GaussianCloud) -> GaussianCloud:
 
 @dataclass(eq=False)
 class GivenScene(ProceduralScene):
-    """Gaussians that are there already, for Python: a YAML names a file.
+    """Wraps Gaussians already in memory; a YAML names a file instead.
 
     Args:
         cloud: The Gaussians.

@@ -37,9 +37,6 @@ def floor(
         fade: Distances from the middle at which the fading starts and ends [m].
         ambient: That of :func:`~gaussian_swaying.scenes.patches.to_cloud`; the colours make up for its light at the
             horizon.
-
-    Returns:
-        The patches, ring by ring.
     """
     edges = [0.0]
     while edges[-1] < _REACH:

@@ -31,6 +31,7 @@ from gaussian_swaying.gaussians.connectivity import attached_pairs
 from gaussian_swaying.gaussians.filling import Filling, InteriorFilling, density_grid
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.grouping import grid_groups, loose_points
+from gaussian_swaying.gaussians.material_fields import MaterialField, MaterialFile, MaterialSource
 from gaussian_swaying.gaussians.model import DeformedGaussians, GaussianSurfaceModel
 from gaussian_swaying.gaussians.openness import openness
 from gaussian_swaying.gaussians.parts import NUMBERS, PartRegion, Parts
@@ -58,14 +59,17 @@ from gaussian_swaying.mpm.materials import known_material
 from gaussian_swaying.mpm.pins import PinnedRegion, RigidRegion
 from gaussian_swaying.mpm.protocol import Solver
 from gaussian_swaying.mpm.state import MaterialPoints, State, bounding_grid
+from gaussian_swaying.mpm.timestep import wave_speed
 from gaussian_swaying.mpm.virtual_nodes import first_nodes, virtual_nodes
 from gaussian_swaying.scenes.procedural import ProceduralScene
 from gaussian_swaying.wind.patches import Patches, joined_directions, second_moments
 
 if TYPE_CHECKING:
     PartsLike = str | os.PathLike[str] | Parts
+    MaterialsLike = MaterialSource | str | os.PathLike[str]
 else:  # what a YAML file can contain
     PartsLike = str | os.PathLike[str]
+    MaterialsLike = MaterialSource | str
 
 
 class Scene(Fixed):
@@ -79,6 +83,9 @@ class Scene(Fixed):
         parts: Which part each Gaussian belongs to, and whether a part is soft, held or still (``parts.npz``, see
             :mod:`~gaussian_swaying.gaussians.parts`); in Python also :class:`~gaussian_swaying.gaussians.parts.Parts`.
             Null for one soft part.
+        materials: A material for each Gaussian: an .npz file, or a
+            :class:`~gaussian_swaying.gaussians.material_fields.MaterialFile` with a largest E. Parts and
+            ``material.regions`` win over it. Null for the one of ``material``.
         opacity_threshold: Gaussians in the region below this opacity carry no mass and feel no wind.
         faint: Treatment of Gaussians below that opacity: ``carry`` (they follow their nearest simulated neighbour),
             ``static`` or ``drop``.
@@ -137,6 +144,7 @@ class Scene(Fixed):
         *,
         region: Region | None = None,
         parts: PartsLike | None = None,
+        materials: MaterialsLike | None = None,
         opacity_threshold: float = 0.1,
         faint: Literal["carry", "static", "drop"] = "carry",
         up: list[float] = [0.0, 0.0, 1.0],  # noqa: B006  (never changed; the schema of the config shows it)
@@ -193,6 +201,14 @@ class Scene(Fixed):
                 "A part of `scene.parts` is `attached` to one other, which has no effect with `scene.connected: grid`: "
                 "set that to surface, or remove `attached`."
             )
+        if isinstance(materials, str | os.PathLike):
+            if not os.fspath(materials).endswith(".npz"):
+                raise ValueError(
+                    "Expected `scene.materials` to be an .npz file, or `class_path` and `init_args` of a "
+                    f"MaterialSource that can be imported, but got {shown(materials)}."
+                )
+            materials = MaterialFile(materials)
+        self.materials = materials
         self.opacity_threshold, self.faint, self.up = float(opacity_threshold), faint, list(up)
         self.longest_side, self.metres_per_unit, self.area = longest_side, metres_per_unit, area
         self.filling, self.wind_on = filling, wind_on
@@ -202,7 +218,7 @@ class Scene(Fixed):
 
     @property
     def area_kind(self) -> str:
-        """``area``, or what null stands for."""
+        """``area``, or the default for this scene."""
         if self.area is not None:
             return self.area
         return "open" if self.ply is not None and self.wind_on == "surface" else "coverage"
@@ -215,7 +231,7 @@ class Scene(Fixed):
         return self.generator.generate()
 
     def select(self, cloud: GaussianCloud) -> Tensor:
-        """The Gaussians that are simulated: in the region, opaque enough, and in no part that is still or hidden.
+        """Mask of the simulated Gaussians: in the region, opaque enough, and in no still or hidden part.
 
         Args:
             cloud: All Gaussians.
@@ -371,8 +387,6 @@ def plate_stiffness(E: Tensor, nu: Tensor, thickness: Tensor) -> Tensor:
     r"""Kirchhoff's stiffness :math:`D = E h^3 / (12 (1 - \nu^2))` of a plate [N m], shape (N,).
 
     Args:
-        E: Young's moduli [Pa], shape (N,).
-        nu: Poisson's ratios, shape (N,).
         thickness: Thicknesses h [m], shape (N,).
     """
     return E * thickness**3 / (12 * (1 - nu.square()))
@@ -386,8 +400,6 @@ def layer_distance(bending: Tensor, E: Tensor, nu: Tensor, thickness: Tensor) ->
 
     Args:
         bending: D [N m], shape (N,).
-        E: Young's moduli [Pa], shape (N,).
-        nu: Poisson's ratios, shape (N,).
         thickness: Thicknesses h [m], shape (N,).
 
     Returns:
@@ -428,8 +440,6 @@ def check_extent(means: Tensor, metres_per_unit: float, dx: float, index: Tensor
 
     Args:
         means: Centres of the simulated Gaussians [scene units], shape (N, 3).
-        metres_per_unit: Length of a scene unit [m].
-        dx: Grid spacing [m].
         index: Indices of the Gaussians in the splat, for the message, shape (N,).
     """
     if len(means) < _FEW:
@@ -459,11 +469,10 @@ def check_extent(means: Tensor, metres_per_unit: float, dx: float, index: Tensor
 
 
 def coarse(side: float, dx: float) -> list[str]:
-    """A sentence about the grid of a run if the object has so few cells that a finer grid would move it otherwise.
+    """A warning, as a list, if the object has so few cells that a finer grid would change its motion; else empty.
 
     Args:
         side: Longest side of the object [m].
-        dx: Grid spacing [m].
     """
     if not SHORT * dx <= side < COARSE * dx:  # shorter ones are warned of at the start
         return []
@@ -471,11 +480,10 @@ def coarse(side: float, dx: float) -> list[str]:
 
 
 def narrow(points: Tensor, dx: float, moved: float) -> list[str]:
-    """A sentence about a tube that is bent and has few cells across, so that the grid decides whether it flattens.
+    """A warning, as a list, if a bent tube has so few cells across that the grid decides whether it flattens.
 
     Args:
         points: Rest positions of the points of a body that is not filled [m], shape (P, 3).
-        dx: Grid spacing [m].
     """
     if len(points) < _FEW or not moved > BENT:
         return []
@@ -504,8 +512,6 @@ def check_density(means: Tensor, metres_per_unit: float, dx: float) -> None:
 
     Args:
         means: Centres of the simulated Gaussians [scene units], shape (N, 3).
-        metres_per_unit: Length of a scene unit [m].
-        dx: Grid spacing [m].
 
     Warns:
         UserWarning: If half of them are farther than three quarters of a cell from the nearest other one.
@@ -519,6 +525,25 @@ def check_density(means: Tensor, metres_per_unit: float, dx: float) -> None:
             f"The Gaussians are {spacing:.3g} m apart, {spacing / dx:.2g} cells of `solver.dx` = {dx:g} m, so the "
             f"material has gaps and its stiffness is wrong: raise `solver.dx` to about {2 * spacing:.2g} m, or set "
             "`scene.particle_spacing` for points between them.",
+            UserWarning,
+            stacklevel=2,
+        )
+
+
+SLOWER = 3.0
+"""Substeps that the stiffest material takes, over those of the median, from which on it is told."""
+
+
+def tell_cost(points: MaterialPoints) -> None:
+    """Warn if the stiffest of a field of materials takes many more substeps than most of it needs."""
+    speed = wave_speed(points).detach().cpu()
+    ratio = float(speed.amax() / speed.median())
+    if ratio > SLOWER:
+        E, few = float(points.youngs_modulus.amax()), float((speed > 0.5 * speed.amax()).double().mean())
+        warnings.warn(
+            f"`scene.materials` has E up to {E:.3g} Pa: {few:.1%} of the material make a frame take {ratio:.3g} times "
+            "the substeps that the median would. `scene.materials.max_E` makes it softer, `rigid_E` rigid, and in "
+            "`solver.formulation: modes` it costs nothing.",
             UserWarning,
             stacklevel=2,
         )
@@ -548,7 +573,7 @@ _BRIDGES = 8  # neighbours to which an extra point on a large Gaussian is attach
 def attached_samples(
     position: Tensor, normal: Tensor, count: int, parts: Parts | None, labels: Tensor | None
 ) -> Tensor:
-    """The pairs of samples of a surface that are attached.
+    """Pairs of attached samples of a surface.
 
     Args:
         position: Rest positions [m], those of the Gaussians first, then extra points, shape (N, 3).
@@ -569,11 +594,10 @@ def attached_samples(
 
 
 def pieces_in_cells(position: Tensor, dx: float, pairs: Tensor) -> Tensor:
-    """A number for each sample, the same for those in one cell that are attached within it.
+    """Labels of samples: equal for those attached to each other within one cell.
 
     Args:
         position: Rest positions [m] in the precision of the solver, shape (N, 3).
-        dx: Grid spacing [m].
         pairs: Pairs of samples that are attached, shape (E, 2).
     """
     a, b = torch.floor(position / dx - 0.5)[pairs].unbind(1)
@@ -582,11 +606,10 @@ def pieces_in_cells(position: Tensor, dx: float, pairs: Tensor) -> Tensor:
 
 @torch.no_grad()
 def lies_apart(position: Tensor, dx: float, pairs: Tensor) -> bool:
-    """True if some node of the grid reaches samples that are not attached to each other there.
+    """True if a grid node reaches samples that are not attached to each other.
 
     Args:
         position: Rest positions [m] in the precision of the solver, shape (N, 3).
-        dx: Grid spacing [m].
         pairs: Pairs of samples that are attached, shape (E, 2).
     """
     grid = bounding_grid(position.amin(0), position.amax(0), dx, margin=0)
@@ -595,13 +618,12 @@ def lies_apart(position: Tensor, dx: float, pairs: Tensor) -> bool:
 
 @torch.no_grad()
 def homes(position: Tensor, dx: float, pairs: Tensor, piece: Tensor) -> tuple[Tensor, Tensor]:
-    """The places at which samples are grouped: a few of a piece beyond the border of a cell, at the next across it.
+    """Places by which samples are grouped; a few that stick out of a cell move to the next across its border.
 
-    They would have copies of nodes of their own, with hardly any mass.
+    Left in their own cell, they would get separate copies of nodes with hardly any mass.
 
     Args:
         position: Rest positions [m], shape (N, 3).
-        dx: Grid spacing [m].
         pairs: Pairs of samples that are attached, shape (E, 2).
         piece: From :func:`pieces_in_cells`, shape (N,).
 
@@ -622,7 +644,7 @@ def homes(position: Tensor, dx: float, pairs: Tensor, piece: Tensor) -> tuple[Te
 
 
 def attached_points(pairs: Tensor, owner: Tensor, parent: Tensor | None, layers: int) -> Tensor:
-    """The pairs of material points that are attached.
+    """Pairs of attached material points.
 
     Args:
         pairs: Pairs of samples, shape (E, 2).
@@ -668,7 +690,6 @@ def joints_of(
         owner: The material point that each belongs to, shape (N,).
         position: Rest positions of the material points [m]; of a sheet of three layers those of the layers one after
             the other, shape (P, 3).
-        dx: Grid spacing [m].
     """
     names, found = [part.name for part in parts.parts], []
     first_layer = int(owner.max()) + 1
@@ -700,22 +721,29 @@ def joints_of(
     return tuple(found)
 
 
-def with_parts(scene: Scene, cloud: GaussianCloud, material: Material, solver: Solver) -> tuple[Material, Solver]:
-    """Material and solver with what the parts of a scene add to them; both stay as they are if it has none.
+def with_parts(
+    scene: Scene, cloud: GaussianCloud, material: Material, solver: Solver, field: MaterialField | None = None
+) -> tuple[Material, Solver]:
+    """Material and solver, extended by the parts of a scene, if it has any.
 
     Args:
-        scene: The scene, all in scene units.
         material: Its ``regions`` come after those of the parts, and win.
-        solver: Gets a body for each part that is rigid, and a pin for all that are held, which holds nodes of the grid.
-
-    Returns:
-        Copies.
+        solver: Gets a body for each part that is rigid and for each rigid body of the ``field``, and a pin for all that
+            are held, which holds nodes of the grid.
     """
     parts = scene.parts
-    if parts is None:
+    if parts is None and field is None:
         return material, solver
     chosen = scene.select(cloud)
-    means, labels = cloud.means[chosen], parts.labels[chosen]
+    means = cloud.means[chosen]
+    if field is not None:
+        bodies = [PartRegion(f"rigid {k + 1}", means, body) for k, body in enumerate(field.rigid_bodies(means))]
+        if bodies:
+            boundaries = FixedList([*solver.boundaries, *map(RigidRegion, bodies)])
+            solver = changed(solver, boundaries=boundaries)
+    if parts is None:
+        return material, solver
+    labels = parts.labels[chosen]
     regions = [
         MaterialRegion(PartRegion(part.name, means, labels == k), **{name: getattr(part, name) for name in NUMBERS})
         for k, part in enumerate(parts.parts)
@@ -743,7 +771,7 @@ SHARED = 4
 
 SIMPSON = (2 / 3, 1 / 6, 1 / 6)  # middle plane and faces of a sheet: exact for the square of the height
 _PROPERTIES = ("E", "nu", "density", "thickness", "bending", "damping_ratio")
-_KINDS = ("E", "nu", "density", "thickness", "bending", "damping")
+_NUMBERS = ("E", "nu", "density", "thickness", "bending", "damping")
 
 
 @dataclass(frozen=True)
@@ -764,6 +792,8 @@ class Samples:
         damping: Rates at which the velocity decays [1/s], shape (N,).
         law_index: Which law applies to each, int64, shape (N,).
         surface: Which are on the surface, bool, shape (N,).
+        kind: With a field of materials, of which a group takes the mean: the samples that may share a group have the
+            same number, shape (N,). None for those of the same material.
     """
 
     position: Tensor
@@ -779,6 +809,7 @@ class Samples:
     damping: Tensor
     law_index: Tensor
     surface: Tensor
+    kind: Tensor | None = None
 
     @property
     def mass(self) -> Tensor:
@@ -791,7 +822,8 @@ class Samples:
         return layer_distance(self.bending, self.E, self.nu, self.thickness)
 
     def choose(self, index: Tensor) -> Samples:
-        return Samples(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+        known = {f.name: getattr(self, f.name) for f in fields(self)}
+        return replace(self, **{name: value[index] for name, value in known.items() if value is not None})
 
     def points(
         self, layers: int, laws: Sequence[ConstitutiveLaw], dtype: torch.dtype, attached: Tensor | None = None
@@ -835,6 +867,7 @@ def sample_object(
     frame: SimFrame,
     dx: float,
     layers: int,
+    field: MaterialField | None,
 ) -> tuple[Samples, list[ConstitutiveLaw]]:
     """The samples of an object with their material, and the laws of the material.
 
@@ -843,9 +876,8 @@ def sample_object(
         normal: Their unit normals, shape (S, 3).
         body_area: Areas that carry material [m²], shape (S,).
         area: Areas that feel the wind [m²], shape (S,).
-        filling: Samples inside a solid, if there are any.
-        frame: Conversion from scene units to metres.
         dx: Grid spacing [m], for ``material.volume = "cell"``.
+        field: Numbers that win over those of the whole material, but not over its regions.
     """
     surface = torch.ones(len(position), dtype=torch.bool)
     if filling is not None:
@@ -858,6 +890,9 @@ def sample_object(
     given = {name: getattr(material, name) for name in _PROPERTIES}
     properties = {name: torch.full_like(area, _number(v)) for name, v in given.items()}
     laws, index = [material.law or FixedCorotated()], torch.zeros(len(position), dtype=torch.long)
+    for name, values in ({} if field is None else field.at(where)).items():
+        properties[name] = torch.where(values.isnan(), properties[name], values)
+    masks: list[Tensor] = []
     for entry in material.regions:
         inside_region = entry.region.contains(where)
         if not bool(inside_region.any()):
@@ -866,6 +901,7 @@ def sample_object(
                 f"The region {entry.region!r} of `material.regions` holds no simulated Gaussian: they lie {between}; "
                 f"{hint or 'move or enlarge it'}."
             )
+        masks.append(inside_region)
         for name in _PROPERTIES:
             if getattr(entry, name) is not None:
                 properties[name][inside_region] = _number(getattr(entry, name))
@@ -892,9 +928,10 @@ def sample_object(
     of_plate = plate_stiffness(properties["E"], properties["nu"], properties["thickness"])
     bending = torch.where(bending.isinf() | (bending.isnan() & (layers == 3)), of_plate, bending.nan_to_num(0.0))
     damping = decay_rate(1.0, 1.0) * properties.pop("damping_ratio").nan_to_num(0.0)
+    kind = None if field is None else equal_rows(torch.stack(masks or [index], -1))
     found = Samples(
         position, normal, body_area, area, volume, **properties, bending=bending, damping=damping, law_index=index,
-        surface=surface,
+        kind=kind, surface=surface,
     )  # fmt: skip
     return found, laws
 
@@ -909,7 +946,6 @@ def cell_volume(position: Tensor, dx: float) -> Tensor:
 
     Args:
         position: Rest position [m], shape (P, 3).
-        dx: Grid spacing [m].
 
     Returns:
         Volume [m³], shape (P,).
@@ -930,15 +966,12 @@ def grouped(
     piece: Tensor | None = None,
     home: Tensor | None = None,
 ) -> tuple[Samples, Tensor, Tensor]:
-    """Samples for a grid: for each group one or a few that keep its mass, centre of mass and volume.
+    """Group samples for a grid: a few points per group, with its mass, centre of mass and volume.
 
-    A group never mixes materials, laws, the surface and the inside, samples that feel wind and samples that do not,
-    pieces, or the two sides of the border of a region in ``apart``.
+    A group never mixes kinds of material, laws, the surface and the inside, samples that feel wind and samples that do
+    not, pieces, or the two sides of the border of a region in ``apart``.
 
     Args:
-        dx: Grid spacing [m].
-        apart: Regions in scene units: those of pins and edits.
-        frame: Conversion from scene units to metres.
         piece: A number for each sample, the same for those that are attached in their cell, shape (N,); None if all
             are.
         home: The places by which they are grouped [m], shape (N, 3), if these are not their own.
@@ -947,12 +980,12 @@ def grouped(
         The points as samples, those on the surface first; the point that each sample belongs to, shape (N,); and the
         group of each point, shape (P,).
     """
-    kinds = torch.stack([getattr(samples, name) for name in _KINDS], -1)
-    kind = equal_rows(kinds)
     where = frame.point_to_scene(samples.position)
     masks = [region.contains(where) for region in apart]
     pieces = [] if piece is None else [piece]
-    label = torch.stack([kind, samples.law_index, samples.surface, samples.area > 0, *masks, *pieces], -1).long()
+    kind = equal_rows(torch.stack([getattr(samples, name) for name in _NUMBERS], -1))
+    kinds = kind if samples.kind is None else samples.kind, samples.law_index, samples.surface, samples.area > 0
+    label = torch.stack([*kinds, *masks, *pieces], -1).long()
     home = samples.position if home is None else home
     matched = per_cell % 2 == 0
     cubes = per_cell // 2 if matched else per_cell
@@ -981,7 +1014,7 @@ def grouped(
 
 @torch.no_grad()
 def shared_wind(samples: Samples, owner: Tensor, parent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The patches that feel the wind, so that the points of a group share its wind as they share its mass.
+    """Distribute the patches of each group over its points, so that wind is shared as mass is.
 
     A group of up to :data:`SHARED` directions is one patch of each direction at each of its points, with an equal part
     of the area: the wind then has the second moments of the group, too. If each patch went to the point next to it,
@@ -1016,14 +1049,12 @@ def shared_wind(samples: Samples, owner: Tensor, parent: Tensor) -> tuple[Tensor
 
 
 def _parted(group: Tensor, parts: Tensor, which: Tensor) -> tuple[Tensor, Tensor]:
-    """Split some groups (M,) into single samples; return the groups (N,), and which of them are divided (M',)."""
     new = torch.where(which[group], len(parts) + torch.arange(len(group)), group)
     kept, group = torch.unique(new, return_inverse=True)
     return group, torch.cat([parts, torch.zeros(len(new), dtype=torch.bool)])[kept]
 
 
 def _points_of(samples: Samples, group: Tensor, parts: Tensor, side: float) -> tuple[Samples, Tensor, Tensor]:
-    """The points of all groups, the point of each sample, (N,), and the group of each point."""
     mass = samples.mass
     position, owner, of = matched_points(samples.position, mass, group, parts, side)
     count = len(position)
@@ -1040,6 +1071,10 @@ def _points_of(samples: Samples, group: Tensor, parts: Tensor, side: float) -> t
     normal = torch.where(solid[:, None], 0.0, torch.where(alone[:, None], found.normal, axis))
     areas = {name: sums(getattr(samples, name), owner, count) for name in ("body_area", "area")}
     volume = sums(samples.volume, group)[of] / share
+    for name in _NUMBERS:
+        values = getattr(samples, name)
+        if bool((values != values[first][group]).any()):  # a field of materials
+            areas[name] = (sums(samples.volume * values, group) / sums(samples.volume, group))[of]
     return replace(found, position=position, normal=normal, volume=volume, **areas), owner, of
 
 
@@ -1101,15 +1136,11 @@ FACING = 0.8
 
 @torch.no_grad()
 def surface_of(samples: Samples, owner: Tensor, points: MaterialPoints, dx: float, contact: Contact | None) -> Surface:
-    """The surface of an object: one of its samples for each part of a cell, with a disc for those that it stands for.
+    """Contact surface of an object: one sample per part of a cell, with a disc that covers those it stands for.
 
     Args:
         owner: A material point close to each, shape (N,).
-        dx: Grid spacing [m].
         contact: Contact of the surface with itself; None if only obstacles count.
-
-    Returns:
-        The surface, in the precision of the points.
     """
     chosen = (samples.surface & (samples.body_area > 0)).nonzero()[:, 0]
     part = samples.choose(chosen)
@@ -1139,7 +1170,7 @@ def surface_of(samples: Samples, owner: Tensor, points: MaterialPoints, dx: floa
 
 @torch.no_grad()
 def close_at_rest(surface: Surface) -> int:
-    """Count pairs of contact samples closer at rest than the thickness, one above the other: they are pushed apart."""
+    """Number of contact pairs closer at rest than the thickness; these are pushed apart."""
     from scipy.spatial import cKDTree
 
     tree = cKDTree(surface.place.double().cpu().numpy())
@@ -1169,7 +1200,7 @@ def warn_close(surface: Surface) -> None:
 def still_distance(
     means: Tensor, covariances: Tensor, opacities: Tensor, low: Tensor, high: Tensor, cells: int, level: float
 ) -> DistanceGrid:
-    """Signed distance from the surface of Gaussians that stand still: where their density passes a level.
+    """Signed distance to the surface of static Gaussians, where their density passes a level.
 
     Args:
         means: Centres [m], shape (N, 3).
@@ -1256,18 +1287,14 @@ def body_of(
     by_grid: bool,
     apart: Sequence[Region],
     labels: Tensor | None = None,
+    field: MaterialField | None = None,
 ) -> Body:
     """Turn Gaussians into what a solver takes: samples, their areas and material, groups, patches.
 
     Args:
         normals: Their unit normals, shape (N, 3).
-        frame: Conversion from scene units to metres.
         dx: Length that the solver resolves [m].
-        apart: Regions whose borders no group crosses, in scene units.
         labels: The part of each Gaussian, shape (N,), if the scene has parts.
-
-    Returns:
-        The body.
     """
     position = frame.point_to_sim(part.means.double())
     source = torch.arange(len(position))  # the Gaussian of each sample of the surface
@@ -1288,7 +1315,7 @@ def body_of(
     body_area = frame.area_to_sim(areas).double()
     area = body_area if scene.wind_on == "all" else torch.where(outer, body_area, 0)
     facing = frame.direction_to_sim(normals[source].double())
-    samples, laws = sample_object(position, facing, body_area, area, filling, material, frame, dx, scene.layers)
+    samples, laws = sample_object(position, facing, body_area, area, filling, material, frame, dx, scene.layers, field)
     chosen, owner, feels = samples, torch.arange(len(samples.position)), samples.area > 0
     patches = samples.normal[feels], samples.area[feels], owner[feels]
     pairs = piece = home = parent = None
@@ -1334,11 +1361,10 @@ def _require_cells_as_large_as(span: Tensor, thickness: Tensor, dx: float) -> No
 def specks_of(
     cloud: GaussianCloud, simulated: Tensor, scene: Scene, frame: SimFrame, dx: float, by_grid: bool
 ) -> Tensor:
-    """The simulated Gaussians that are not connected to the object, if ``scene.loose`` carries them.
+    """Indices of simulated Gaussians not connected to the object, if ``scene.loose`` carries them.
 
     Args:
         simulated: Indices of those that are simulated, shape (N,).
-        frame: Conversion from scene units to metres.
         dx: Length that the solver resolves [m].
 
     Returns:
@@ -1434,6 +1460,7 @@ class SimulatedScene(nn.Module):
         apart: Regions whose borders no group of Gaussians crosses, in scene units: those of pins and edits.
         embedded: Returns how places are read from a state (``Solver.embedded``); where it returns None, the Gaussians
             follow the points.
+        field: Materials that differ from Gaussian to Gaussian.
 
     Attributes:
         simulated: Indices of the simulated Gaussians.
@@ -1459,6 +1486,7 @@ class SimulatedScene(nn.Module):
             ``scene.connected: surface``; else None.
         source: The .ply file; None for a scene made in code.
         parts: The labels of its Gaussians, with roles and materials, or None.
+        field: The materials of its Gaussians, or None.
     """
 
     def __init__(
@@ -1471,10 +1499,11 @@ class SimulatedScene(nn.Module):
         fixed: bool = True,
         apart: Sequence[Region] = (),
         embedded: Callable[..., EmbeddedPoints | None] = EmbeddedInGrid,
+        field: MaterialField | None = None,
     ) -> None:
         super().__init__()
         cloud = scene.cloud() if cloud is None else cloud
-        self.source, self.parts = scene.ply, scene.parts
+        self.source, self.parts, self.field = scene.ply, scene.parts, field
         by_grid = scene.points == "grid" or (scene.points is None and fixed)
         if by_grid and not fixed:
             raise ValueError(
@@ -1519,8 +1548,10 @@ class SimulatedScene(nn.Module):
             normals = normals.index_put((simulated,), neighbour_normals(*parts))
         part = cloud.select(simulated)
         labels = None if scene.parts is None else scene.parts.labels[self.drawn][simulated]
-        body = body_of(part, normals[simulated], scene, material, self.frame, dx, dtype, by_grid, apart, labels)
+        body = body_of(part, normals[simulated], scene, material, self.frame, dx, dtype, by_grid, apart, labels, field)
         self.points, self.patches = body.points, body.patches
+        if field is not None:
+            tell_cost(body.points)
         self.joints = self._joints(scene, labels, body, dx)
         self.pairs = None if body.pairs is None else body.pairs[(body.pairs < len(simulated)).all(1)]
         self.on_surface, self.filled = body.on_surface, body.points.count // scene.layers - body.on_surface
@@ -1614,7 +1645,7 @@ class SimulatedScene(nn.Module):
 
     @torch.no_grad()
     def still_distance(self, low: Tensor, high: Tensor, cells: int, level: float = 0.5) -> DistanceGrid:
-        """Signed distance from the surface of the Gaussians that stand still, in a box.
+        """Signed distance to the surface of the static Gaussians in a box.
 
         Args:
             low: Lower corner of the box [m], shape (3,).
@@ -1659,9 +1690,6 @@ class SimulatedScene(nn.Module):
             state: State of one scene, fields of shape (P, ·).
             rotations: Whether to compute the rotations; otherwise they are those at rest, which is enough for colours
                 that are the same from every direction.
-
-        Returns:
-            All Gaussians, the static ones at rest.
         """
         rest, index = self.rest(), self.moving
         parts: dict[str, Any] = self.moved(state, rotations)
@@ -1670,7 +1698,7 @@ class SimulatedScene(nn.Module):
         return replace(rest, **parts)
 
     def moved(self, state: State, rotations: bool = True) -> dict[str, Any]:
-        """The Gaussians that move, in the order of ``moving``: the fields that :meth:`deformed` changes, by name."""
+        """Fields of the moving Gaussians that :meth:`deformed` changes, by name, in the order of ``moving``."""
         rest, index = self.rest(), self.moving
         own = rest.means, rest.covariances, rest.normals
         if not self.all_move:
@@ -1707,11 +1735,10 @@ class SimulatedScene(nn.Module):
         return self._kept[1]
 
     def on_gaussians(self, values: Tensor) -> Tensor:
-        """Values of the moving Gaussians (M,) for all of them (N,); the static ones get 0."""
+        """Spread values of the moving Gaussians (M,) to all (N,); static ones get 0."""
         own = values.to(self.model.means.dtype)
         return own.new_zeros(len(self.model.means)).index_copy(0, self.moving, own)
 
 
 def _arm(arm: Tensor, dtype: torch.dtype) -> Tensor | None:
-    """Arms in the precision of the solver; None if all are zero."""
     return arm.to(dtype) if bool(arm.any()) else None

@@ -246,7 +246,7 @@ class Painter(Fixed, nn.Module):
         return still, torch.cat([model.sh0[index], model.shN[index]], 1)
 
     def shade(self, gaussians: DeformedGaussians, camera: Camera) -> DeformedGaussians:
-        """The same Gaussians with their colours as a camera sees them."""
+        """The Gaussians with colours as seen from a camera."""
         return replace(gaussians, colors=self.colors(gaussians, camera))
 
     @in_turn
@@ -278,7 +278,6 @@ def draw(
     """The picture of a state of :func:`~gaussian_swaying.simulation.step.step`.
 
     Args:
-        camera: In scene units.
         shader: Colours from normals and light; None keeps the colours of the splat.
         background: Background colour, in [0, 1].
 
@@ -294,7 +293,7 @@ def draw(
 
 
 def seen_from(sh: Tensor, eye: Tensor, means: Tensor, rotations: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Directions from the eye, and colours from there in the rest frame of each Gaussian, both (N, 3)."""
+    """Directions from the eye, and colours seen along them in each Gaussian's rest frame, both (N, 3)."""
     view = torch.nn.functional.normalize(means - eye, dim=-1)
     at_rest = view if rotations is None else (view[..., None] * rotations).sum(-2)
     return view, sh_to_color(sh, at_rest)
@@ -303,8 +302,8 @@ def seen_from(sh: Tensor, eye: Tensor, means: Tensor, rotations: Tensor | None) 
 class CopiesPainter(Painter):
     """Draws the static Gaussians once and the object once for each copy, all from one splat.
 
-    What is drawn are S static Gaussians, and for each of the B copies M that move and H of parts that are held. Only
-    centres, shapes, normals and colours exist for each copy; harmonics and opacities are those of the splat.
+    With S static Gaussians, B copies, and M moving and H held ones in each. Only centres, shapes, normals and colours
+    exist for each copy; harmonics and opacities are those of the splat.
 
     Args:
         stepper: Has copies.
@@ -397,14 +396,11 @@ STEPS = 12
 
 
 def streaks(stepper: Stepper, state: State, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Pieces of the lines along which the air flows at one moment, near a plane through the object.
+    """Streamline segments of the air at one moment, near a plane through the object.
 
     The plane contains the direction of the flow, and is upright or level, whichever the camera sees better. They start
     at the points of a lattice that drifts with the mean flow, so that they move from frame to frame as the air does,
     and are as long as the air flows in a fixed time: an eighth of the picture at the speed of the flow.
-
-    Args:
-        camera: The camera, in scene units.
 
     Returns:
         Places, scene units, shape (S, STEPS + 1, 3), and the speed at them [m/s], shape (S, STEPS + 1).
@@ -476,7 +472,7 @@ def speed_scale(stepper: Stepper) -> float:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A moment of a simulation as a camera sees it: what a pass draws.
+    """The scene at one moment from one camera: the input of a pass.
 
     Args:
         painter: Draws the scene; it has the stepper.
@@ -511,7 +507,7 @@ class View:
         return distance - size, distance + size
 
     def blend(self, values: Tensor) -> RenderOutput:
-        """Three values of each Gaussian, shape (N, 3), blended like colours over zero."""
+        """Blend three values per Gaussian, shape (N, 3), like colours, over zero."""
         painter, own = self.painter, self.gaussians
         return painter.renderer(own.means, own.covariances, painter.opacity(), values, self.camera)
 
@@ -655,9 +651,6 @@ class Frame:
 
         Args:
             camera: Name of one of ``cameras``; empty for the main ``camera``.
-
-        Returns:
-            Colour, opacity and depth.
         """
         painter, gaussians = self.painter, self.gaussians
         if camera and camera not in painter.cameras:

@@ -173,7 +173,7 @@ class Measurement:
         self._found: dict[str, list[Any]] = {}
 
     def again(self, substeps: int, values: Tensor) -> Measurement:
-        """The same measurements of another frame, with its numbers in the order of ``values``."""
+        """A copy for another frame, with new ``values`` in the same order."""
         new = copy.copy(self)
         new._substeps, new.values, new._found = substeps, values, {}
         return new
@@ -210,7 +210,6 @@ class Measurement:
         return self._scene(0) if self._scenes == 1 else _joined([self._scene(k) for k in range(self._scenes)])
 
     def each(self) -> tuple[FrameDiagnostics, ...]:
-        """The measurements of each scene; substeps and Courant number are those of all."""
         self._wait()
         return tuple(self._scene(k) for k in range(self._scenes))
 
@@ -234,7 +233,6 @@ _WHOSE = dict(zip(_PARTICLES, ("displacement_max", "stretch_min", "stretch_max")
 
 
 def _joined(scenes: Sequence[FrameDiagnostics]) -> FrameDiagnostics:
-    """The measurements of a batch: sums, extremes with their particles, and the mean of mean displacements."""
     first, found = scenes[0], {}
     for name in _OF_SCENE:
         values = [getattr(scene, name) for scene in scenes]
@@ -394,7 +392,6 @@ def _verdict(solver: Solver, state: State, moved: Tensor) -> Tensor:
 
 
 def _raise_if_bad(solver: Solver, verdict: list[float], time: float) -> None:
-    """Raise SimulationDiverged if the values of :func:`_verdict` name a particle."""
     wrong, particle, lost = (int(value) for value in verdict[:3])
     if wrong == 0:
         return
@@ -456,9 +453,6 @@ def advice(found: Mapping[str, Any], E: float, thickness_matters: bool = True) -
 
     Args:
         E: Largest Young's modulus of the run [Pa].
-
-    Returns:
-        The sentences.
     """
     low, high = SOUND
     small, large, moved = found["compressed"], found["stretched"], found["moved"]

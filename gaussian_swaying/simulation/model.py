@@ -73,12 +73,12 @@ def _all() -> dict[str, Live]:
 
 
 def names() -> list[str]:
-    """The names of all numbers that may change; ``*`` stands for the place of a modulation."""
+    """Names of all numbers that may change; ``*`` stands for the index of a modulation."""
     return list(_all())
 
 
 def find(name: str) -> Live | None:
-    """The number of a name, or None. ``wind.modulations.0.FIELD`` is any number of a modulation of the wind."""
+    """The number with a name, or None. ``wind.modulations.0.FIELD`` is a number of a modulation."""
     parts = name.split(".")
     if parts[:2] == ["wind", "modulations"] and len(parts) == 4 and parts[2].isdecimal():
         return _all().get(f"wind.modulations.*.{parts[3]}", Live(batched=True))
@@ -175,7 +175,6 @@ class Model:
         return found
 
     def _owner(self, name: str) -> Any:
-        """The part that has a number; None if it is not there."""
         head, *path = name.split(".")[:-1] or [""]
         if head == "forces":
             return next((force for force in self.forces if type(force).__name__ == path[0]), None)
@@ -217,10 +216,10 @@ def _with_material(model: Model, numbers: Mapping[str, Any]) -> Model:
     points, material = model.points, model.material
     bends = material.bending is not None or any(part.bending is not None for part in material.regions)
     for name in numbers:
-        if any(getattr(part, name) is not None for part in material.regions):
+        if any(getattr(part, name) is not None for part in (*material.regions, model.scene.field) if part is not None):
             raise ValueError(
-                f"`material.{name}` is to change, but `material.regions` or `scene.parts` gives it too: remove it "
-                "there."
+                f"`material.{name}` is to change, but `material.regions`, `scene.parts` or `scene.materials` gives it "
+                "too: remove it there."
             )
         if bends and points.bending is None and name in ("E", "nu"):
             raise ValueError(
@@ -248,7 +247,6 @@ def _with_material(model: Model, numbers: Mapping[str, Any]) -> Model:
 
 
 def _check_one_layer(model: Model) -> None:
-    """Raise ValueError unless the object is a sheet of one layer, whose points stay if it gets thicker."""
     scene = model.scene
     if model.material.volume != "patch" or scene.filled or model.points.count != scene.on_surface + scene.filled:
         raise ValueError(
@@ -274,7 +272,7 @@ def in_settings(settings: Namespace, values: Mapping[str, Any]) -> None:
 
 
 def of_settings(settings: Namespace, name: str) -> Any:
-    """The value of a number in parsed settings."""
+    """A number from parsed settings."""
     if name in POLAR:
         return angles_of(settings.wind.flow)[POLAR.index(name)]
     part, key = _place(settings, name)
@@ -282,7 +280,6 @@ def of_settings(settings: Namespace, name: str) -> Any:
 
 
 def _place(settings: Namespace, name: str) -> tuple[Any, str]:
-    """The part of parsed settings that has a number, and its name there."""
     parts = name.split(".")
     if parts[0] == "forces":
         entry = next((one for one in settings.forces or () if one["class_path"].rsplit(".", 1)[-1] == parts[1]), None)
@@ -298,7 +295,7 @@ def _place(settings: Namespace, name: str) -> tuple[Any, str]:
 
 
 def flow_of(base: Sequence[float], values: Mapping[str, float]) -> list[float]:
-    """A flow [m/s] with some of ``wind.speed``, ``wind.azimuth`` and ``wind.elevation`` replaced.
+    """A flow [m/s] with ``wind.speed``, ``wind.azimuth`` or ``wind.elevation`` replaced.
 
     Example:
         >>> [round(x, 3) for x in flow_of([2.0, 0.0, 0.0], {"wind.azimuth": 90.0})]
@@ -367,7 +364,7 @@ class Edit:
 
     @property
     def of_material(self) -> bool:
-        """True if more than the colour changes."""
+        """True if the edit changes more than the colour."""
         return any(value is not None for value in (self.E, self.nu, self.density, self.law))
 
 
@@ -418,7 +415,7 @@ def edited_points(points: MaterialPoints, inside: Tensor, edit: Edit, flowed: bo
 
 
 def recolored(sh: Tensor, inside: Tensor, color: Sequence[float], detail: float = 0.0) -> Tensor:
-    """Spherical harmonics of a splat, with one colour for a part of it.
+    """Give some Gaussians of a splat one colour.
 
     Args:
         sh: Coefficients, shape (N, K, 3).
@@ -442,7 +439,7 @@ def recolored(sh: Tensor, inside: Tensor, color: Sequence[float], detail: float 
 @fixed
 @dataclass
 class Copy:
-    """One of several copies of the object. Without values it is the object itself, at its own place.
+    """One copy of the object. By default it is the object itself, at its own place.
 
     Args:
         shift: Where it stands, from the place of the object [m]: z up, along the axes of the wind.
@@ -671,7 +668,7 @@ def as_solver(
 
 
 def as_wind(wind: WindLike | None, frame: SimFrame) -> WindField | SpatialWind:
-    """Return the given wind, a look by its name, a steady wind from three numbers [m/s], or still air for None.
+    """Convert to a wind: a wind, a look by its name, a steady flow from three numbers [m/s], or None for still air.
 
     Places of its effects are converted from scene units to metres.
     """

@@ -35,7 +35,7 @@ def splat_checksum(scene: SimulatedScene) -> str | None:
 
 
 def parts_checksum(scene: SimulatedScene) -> str | None:
-    """Checksum of the parts of a scene, as their file may have been painted over."""
+    """Checksum of the parts of a scene, as their file may change."""
     return None if scene.parts is None else scene.parts.digest()
 
 
@@ -96,7 +96,6 @@ class WallClock:
 
     @contextmanager
     def __call__(self, part: str) -> Iterator[None]:
-        """Add the time of the block to a part."""
         if self.device.type == "cuda" and part != "writing":
             stream = torch.cuda.current_stream(self.device)
             start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
@@ -127,7 +126,7 @@ NODAL = "node_displacement"
 
 
 class Closing:
-    """Makes the end of a recorded motion its beginning, see ``recorder.loop``.
+    """Makes a recorded motion loop, see ``recorder.loop``.
 
     Args:
         scene: The scene.
@@ -152,7 +151,6 @@ class Closing:
             raise ValueError(f"With `recorder.loop`, `recorder.renders` cannot have {', '.join(others)}: leave it out.")
 
     def __call__(self, state: State, frame: int) -> State:
-        """The state to record in place of that of a frame."""
         late = frame - (self.frames - self.count)
         if frame < self.count:
             self._first.append({name: part.clone() for name, part in self._motion(state).items()})
@@ -168,17 +166,15 @@ class Closing:
         return state.replace(**motion)
 
     def _motion(self, state: State) -> dict[str, Tensor]:
-        """What the Gaussians follow, and what is recorded of the nodes."""
         follow = self.scene.follow
         motion, nodal = {name: getattr(state, name) for name in follow.reads}, follow.nodal(state)
         return motion if nodal is None else motion | {NODAL: nodal}
 
     def kept(self) -> dict[str, Any]:
-        """What a run needs to be resumed."""
         return {"frames": self.frames if self.count else None, "count": self.count, "first": list(self._first)}
 
     def resume(self, kept: dict[str, Any]) -> None:
-        """Go on with what :meth:`kept` returned."""
+        """Restore what :meth:`kept` returned."""
         if (kept["frames"], kept["count"]) != (self.kept()["frames"], self.count):
             raise ValueError(
                 "A motion that closes has a length: resume with the `frames` and the `recorder.loop` of the run, or "
@@ -226,11 +222,7 @@ class Run:
 
     @torch.inference_mode()
     def whole(self, output: Path, resume: bool, settings: dict[str, Any], progress: bool) -> dict[str, Any]:
-        """Run from rest, or from a checkpoint, to the end; see ``Simulation.run``.
-
-        Returns:
-            The summary.
-        """
+        """Run from rest, or from a checkpoint, to the end; see ``Simulation.run``."""
         frames, recorder, painter = self.frames, self.recorder, self.painter
         for look in range(min(frames, MAX_LOOKS)):  # all of them, unless there are very many
             painter.check_camera(look * (frames - 1) // max(min(frames, MAX_LOOKS) - 1, 1))
@@ -307,10 +299,6 @@ class Run:
 
         Args:
             status: ``complete``, or how the run ended.
-            reason: Why, if it is not complete.
-
-        Returns:
-            The summary.
         """
         recorder = self.recorder
         summary: dict[str, Any] = {"status": status, "reason": reason}
@@ -329,7 +317,6 @@ class Run:
         return summary
 
     def warm_up(self, state: State, frame: int) -> None:
-        """Load and compile the kernels of a frame; its results are thrown away."""
         with suppress(SimulationDiverged):  # the real frame will report it
             state, _ = self.stepper.advance(state)
         if self.recorder.images:
@@ -365,12 +352,10 @@ class Run:
 
     @property
     def recording(self) -> bool:
-        """True if anything is written in a frame."""
         recorder = self.recorder
         return recorder.images or recorder.trajectory or recorder.nodes
 
     def record(self, state: State, frame: int) -> None:
-        """Draw and record the requested outputs of a frame."""
         recorder, walls = self.recorder, self.walls
         state, frame = self.closing(state, frame), frame - self.closing.count
         if frame < 0:
@@ -405,7 +390,6 @@ class Run:
                 self.recorder.write_raw(frame, numbers, frame_folder(render, name))
 
     def summary(self, state: State, log: list[dict[str, Any]]) -> dict[str, Any]:
-        """The summary of a run; docs/runs.md describes it."""
         stepper, scene, points = self.stepper, self.scene, self.stepper.model.points
         moved = [entry["displacement_mean"] for entry in log]
         found, sentences = run_health(stepper, log)

@@ -87,7 +87,7 @@ from gaussian_swaying.wind.force import AeroForce
 def load_ahead(device: torch.device) -> Callable[[], None]:
     """Begin to load what a device needs, in a thread: its context, Triton's compiler and gsplat's kernels.
 
-    What cannot be loaded is left to those who need it, who meet the error. Nothing is compiled that takes long.
+    Failures are ignored; the first use reports them. Nothing that takes long is compiled.
 
     Args:
         device: The device of a simulation; only a CUDA device needs anything.
@@ -222,12 +222,13 @@ class Simulation(Fixed):
             if hold is not None:
                 raise ValueError("`hold` cannot be combined with `normalisation`: give a solver with the pins.")
             settings, material, solver, edits = normalisation.place(settings, material, solver, edits, cloud)
-        material, solver = with_parts(settings, cloud, material, solver)
+        field = None if settings.materials is None else settings.materials(cloud)
+        material, solver = with_parts(settings, cloud, material, solver, field)
         apart = [
             part.region for part in (*solver.boundaries, *edits) if isinstance(getattr(part, "region", None), Region)
         ]
         fixed, kind = bool(solver.neighbours_fixed), getattr(torch, dtype)
-        seen = SimulatedScene(settings, material, solver.dx, kind, cloud, fixed, apart, solver.embedded)
+        seen = SimulatedScene(settings, material, solver.dx, kind, cloud, fixed, apart, solver.embedded, field)
         if contact is not None and not fixed:
             raise ValueError(
                 "`contact` needs `solver.formulation: total`: leave it out, as in `updated` material meets on the grid."
@@ -374,7 +375,6 @@ class Simulation(Fixed):
         self._recorder = self._recorder_or(recorder)
 
     def _recorder_or(self, recorder: Recorder | None) -> Recorder:
-        """A recorder of its own like the given one, or by default: with copies, of pictures."""
         if recorder is None and self._stepper.copies is not None:
             return Recorder(trajectory=False, nodes=False)
         return copy.copy(recorder or Recorder())
@@ -396,7 +396,7 @@ class Simulation(Fixed):
 
     @in_turn
     def adopt(self, model: Model) -> None:
-        """Continue with another model of the same scene, as :meth:`change` does with single numbers."""
+        """Continue with another model of the same scene; :meth:`change` does this for single numbers."""
         before, editor = self.model, self._editor
         if model.points is not before.points and editor.edits:
             raise ValueError("`edits` give the material of parts of the object: change it there, not everywhere.")
@@ -434,7 +434,7 @@ class Simulation(Fixed):
         return other
 
     def batch(self, models: Sequence[Model]) -> Stepper:
-        """Several models of this scene as one, such as ``[model, model.at("wind.speed", 9)]``: in one rollout.
+        """Combine models of this scene, such as ``[model, model.at("wind.speed", 9)]``, to one rollout.
 
         Args:
             models: They may differ in wind and material.
@@ -449,7 +449,6 @@ class Simulation(Fixed):
         return Stepper(self.solver.like(models[0].solver), models, turn=self.turn)
 
     def _running(self) -> dict[str, tuple[object, list[object]]]:
-        """What runs now by its names: each with the objects and versions of tensors that change if it does."""
         model, painter = self.model, self._painter
         parts = {name: getattr(model, name) for name in ("material", "wind", "aero", "forces", "air", "frame_dt")}
         parts |= {name: getattr(painter, name) for name in ("shader", "camera", "cameras", "background")}
@@ -551,9 +550,6 @@ class Simulation(Fixed):
             state: The current state.
             edits: The changes, in this order.
 
-        Returns:
-            The state from which the run continues.
-
         Raises:
             ValueError: If a region contains nothing, or a plastic law is used in the ``total`` formulation.
         """
@@ -633,9 +629,6 @@ def run_batch(
 
     Args:
         folders: Folder of each; None for one that is only simulated.
-
-    Returns:
-        The summaries.
     """
     batch = members[0].batch([member.model for member in members])
     state = batch.start()
@@ -679,7 +672,7 @@ def run_batch(
 
 
 class RecordedRun:
-    """The motion in the folder of a run, and the simulation of its configuration and splat.
+    """A recorded run: its motion, and a simulation rebuilt from its configuration and splat.
 
     Args:
         folder: The output folder of ``gaussian-swaying sim``.
@@ -778,7 +771,6 @@ class RecordedRun:
             yield editor.scene.deformed(state)
 
     def _states(self) -> Iterator[Any]:
-        """What the Gaussians follow in each frame."""
         start, trajectory = self.start, self.folder / "trajectory.npz"
         if (self.folder / "nodes.npz").is_file():
             nodes, displacement = self.nodes()

@@ -50,7 +50,7 @@ from gaussian_swaying.wind.tables import Shelter
 
 
 class Copies(nn.Module):
-    """The copies of an object: its ``x`` lies at ``A x + b`` in each copy, and each feels the wind there.
+    """Copies of an object: a point ``x`` lies at ``A x + b`` in each copy, which feels the wind there.
 
     Args:
         copies: The copies.
@@ -93,7 +93,7 @@ class Copies(nn.Module):
         return len(self.copies)
 
     def winds(self, wind: Wind) -> Wind | Sequence[Wind]:
-        """The wind of the object with the gusts of each copy."""
+        """The wind, with the gusts of each copy."""
         if not isinstance(wind, WindField):
             return [wind] * len(self)
         own = int(wind.seed)
@@ -103,11 +103,11 @@ class Copies(nn.Module):
         ])  # fmt: skip
 
     def place(self, copy: int, points: Tensor) -> Tensor:
-        """Points (..., 3) of the object as they lie in a copy [scene units]; computed in float64, for far copies."""
+        """Points (..., 3) of the object transformed to a copy [scene units], in float64."""
         return (in_double(points) @ self.rotation[copy].mT + self.offset[copy]).to(points)
 
     def in_object(self, point: Tensor) -> Tensor:
-        """The points of the object that lie at a point (3,) of the scene in each copy [scene units], shape (B, 3)."""
+        """Points of the object that coincide with a scene point (3,) in each copy [scene units], shape (B, 3)."""
         found: Tensor = ((point.to(self.offset) - self.offset)[:, None] @ self.rotation)[:, 0]
         return found
 
@@ -220,7 +220,6 @@ class Stepper:
 
     @property
     def scene(self) -> SimulatedScene:
-        """Gaussians, material points and patches."""
         return self.model.scene
 
     @property
@@ -234,7 +233,6 @@ class Stepper:
 
     @property
     def wind_force(self) -> WindForce:
-        """The wind on the patches of the scene, or of all scenes."""
         first = self.models[0]
         parts = (first.aero, first.scene.patches, *(model.wind for model in self.models))
         if self._wind_force is None or any(a is not b for a, b in zip(self._wind_force[0], parts, strict=True)):
@@ -243,7 +241,6 @@ class Stepper:
         return self._wind_force[1]
 
     def _wind_on(self) -> WindForce:
-        """The wind on the patches of all scenes, computed together where it can be."""
         first, winds, places = self.models[0], [model.wind for model in self.models], None
         alone = WindForce(first.aero, first.wind, first.scene.patches)
         if not self.batched:
@@ -257,7 +254,7 @@ class Stepper:
 
     @property
     def materials(self) -> tuple[MaterialPoints, ...]:
-        """The material of each scene as the solver gets it: that of its model, with the air that it carries."""
+        """Material of each scene for the solver, with the mass of carried air."""
         known, self._materials, found = self._materials, {}, []
         for model in self.models:
             points, patches, aero = model.points, model.scene.patches, model.aero
@@ -275,7 +272,7 @@ class Stepper:
 
     @property
     def joints(self) -> list[Force]:
-        """The force of the joints between parts, if there are any; made again for another material."""
+        """Force of the joints between parts, or None; rebuilt when the material changes."""
         joints = self.scene.joints
         if not joints:
             return []
@@ -326,7 +323,7 @@ class Stepper:
         return self.wind_force.air(state.time, place)
 
     def flows(self) -> Tensor:
-        """Flows of the wind without gusts [m/s], shape (K, 3); those of a spatial wind are at the particles."""
+        """Mean flows of the wind [m/s], shape (K, 3); of a spatial wind, at the particles."""
         winds = [model.wind for model in (self.models if self.copies is None else [self.model])]
         flows = [wind.flows for wind in winds if isinstance(wind, WindField)]
         if len(flows) == len(winds):
@@ -350,7 +347,7 @@ class Stepper:
         return scene.on_gaussians(torch.where(scene.in_wind, torch.linalg.vector_norm(force, dim=-1), 0.0))
 
     def force_scale(self) -> float:
-        """Force per area [Pa] that the wind's flow, without gusts, can exert on a patch at rest; 1 in still air."""
+        """Largest force per area [Pa] of the wind without gusts on a patch at rest; 1 in still air."""
         aero = self.model.aero
         speed = float(torch.linalg.vector_norm(self.flows().detach(), dim=-1).amax())
         coefficients = float(torch.stack([aero.C_D, aero.C_F, aero.C_L]).detach().abs().sum())
@@ -360,7 +357,6 @@ class Stepper:
 
     @in_turn
     def start(self) -> State:
-        """The state at rest at time zero."""
         self.starts += 1
         if isinstance(self.solver, MPMSolver):
             self.solver.choose(anew=True)
@@ -402,13 +398,12 @@ class Stepper:
             return state.replace(air=self._air.start(state.time))
 
     def rehearse(self) -> None:
-        """Raise the errors that a start with the present model would raise."""
+        """Raise the errors that starting with the present model would raise."""
         rehearsed = self.bind()
         self.solver.prepare()
         self.solver.substeps(rehearsed, self.frame_dt)
 
     def _restiffened(self) -> bool:
-        """Give the solver the material if it has another stiffness, and nothing else has changed."""
         before, now, stiffness = self._bound, self.materials, ("youngs_modulus", "poisson_ratio")
         others = [field.name for field in fields(MaterialPoints) if field.name not in stiffness]
         if len(before) != len(now) or any(
@@ -422,7 +417,6 @@ class Stepper:
         return True
 
     def bind(self) -> State:
-        """Bind the solver to the material; returns the state at rest."""
         scene, self._bound = self.scene, self.materials
         points = MaterialPoints.stack(self._bound) if self.batched else self._bound[0]
         state: State = self.solver.init_state(points, frame=scene.frame, surface=scene.surface_places)
@@ -449,7 +443,6 @@ class Stepper:
         return f"it leans by {lean:.0%} of its size, more than modes can show" if lean > MOST_LEAN else None
 
     def _lean(self, bound: Modes) -> float:
-        """Mean displacement of the tenth that moves most in the strongest steady wind, over the longest side."""
         first, flows = self.model, self.flows().detach()
         strongest = WindField(flows[flows.norm(dim=-1).argmax()])
         state = bound.leaning(WindForce(first.aero, strongest, _repeated(first.scene.patches, len(self.models))))
@@ -459,7 +452,6 @@ class Stepper:
         return float(moved.topk(max(1, len(moved) // 10)).values.mean() / side)
 
     def _check_rounding(self, state: State, dt: float) -> None:
-        """Raise ValueError if rounding moves the material at rest nearly as fast as wind and gravity do."""
         drive = math.hypot(*self.solver.gravity)  # for a second
         if not self.idle:
             drive = max(drive, float(torch.linalg.vector_norm(self.flows().detach(), dim=-1).amax()))
@@ -505,16 +497,11 @@ class Stepper:
 
     @in_turn
     def advance(self, state: State) -> tuple[State, FrameDiagnostics]:
-        """Advance by one frame.
-
-        Returns:
-            The state at its end, and its diagnostics.
-        """
         return self.launch(state).finish()
 
     @in_turn
     def launch(self, state: State, steps: int | None = None) -> Launched:
-        """Pass a frame to the device; ``launch(state).finish()`` is :meth:`advance`, and the host can work between.
+        """Start computing a frame; ``launch(state).finish()`` is :meth:`advance`, and the host may work between.
 
         Args:
             steps: Number of substeps, as several batches that are compared take; those that it needs if None.
@@ -546,7 +533,7 @@ class Stepper:
         return self._gauge(self.solver, end, steps, courant, state, needs, same, self.lift)
 
     def at_first(self, state: State) -> Measurement:
-        """Start measuring a state, such as the first, without a frame that led to it."""
+        """Start measuring a state that no frame led to, such as the first."""
         return measure(self.solver, state, 0, 0.0, lift=self.lift)
 
     def give_up(self, state: State, cause: str, remedy: str | None = None) -> NoReturn:
@@ -558,7 +545,7 @@ class Stepper:
 
     @property
     def foresees(self) -> bool:
-        """True if the needs of the next frame are measured at the end of a frame, so that the host waits once."""
+        """True if the next frame's needs are measured with this frame, so that the host waits once."""
         simple = self.solver.substep is None and self.solver.stiffness_damping == 0
         return simple and self.solver.has_kernels and self.wind_force.recordable
 
@@ -605,7 +592,6 @@ class Stepper:
         )
 
     def _roll_with_air(self, state: State, substeps: int, watch: Callable[[int], None] | None) -> tuple[State, Tensor]:
-        """As :meth:`roll`, of the body and the computed air."""
         air = self._air
         assert air is not None
         if state.air is None or air.frame_dt != self.frame_dt:
@@ -618,7 +604,7 @@ class Stepper:
 
 
 def stepper_of(model: Model) -> Stepper:
-    """What advances a model and those that were made from it: what they have in common is computed once."""
+    """The stepper shared by a model and all models made from it."""
     if "stepper" not in model.shared:
         model.shared["stepper"] = Stepper(model.method.like(model.solver), model)
     stepper: Stepper = model.shared["stepper"]
@@ -637,7 +623,7 @@ def start(model: Model) -> State:
 
 
 def step(model: Model, state: State) -> State:
-    """A frame later: in as many substeps as are stable, done again with shorter ones where these were too long.
+    """Advance by one frame, with as many substeps as are stable.
 
     A function of its arguments, through which gradients reach numbers of the model and the state. Models that differ in
     numbers share what does not depend on them, so ``model.at("wind.speed", 9)`` may be another one in every frame.
@@ -706,7 +692,6 @@ class Launched:
 
     @property
     def each(self) -> tuple[FrameDiagnostics, ...]:
-        """The diagnostics of each scene of a batch, when it is finished."""
         return self._measurement.each()
 
     def _launch(self, margin: int) -> tuple[State, Measurement]:
@@ -746,7 +731,7 @@ class Outlook:
         self._read = [weakref.ref(tensor) for tensor in _read(state)]
 
     def holds(self, state: State, parts: tuple[object, ...] | None) -> bool:
-        """True if the frame starts from this state and nothing changed since; ``parts`` is the result of now."""
+        """True if the next frame starts from this state and ``parts`` is unchanged."""
         same = all(known() is tensor for known, tensor in zip(self._read, _read(state), strict=False))
         return same and self._parts is not None and self._parts == parts
 
@@ -757,7 +742,7 @@ def _read(state: State) -> list[Tensor]:
 
 
 def parts_of(stepper: Stepper) -> tuple[object, ...] | None:
-    """Return the key of all that the needs depend on besides the state; None if changes cannot be detected.
+    """Key of all that the needs of a frame depend on besides the state; None if changes cannot be detected.
 
     That is so for tensors of inference mode, and for tensors on another device than the simulation.
     """
@@ -799,14 +784,12 @@ def why_not_batched(model: Model) -> str | None:
 
 
 def _repeated(patches: Patches, count: int) -> Patches:
-    """The patches of several scenes, one after the other."""
     shift = patches.count * torch.arange(count, device=patches.point.device)
     point = (patches.point + shift[:, None]).reshape(-1)
     return Patches(patches.normal.repeat(count, 1), patches.area.repeat(count), point, patches.count * count)
 
 
 def _raised_here(error: BaseException) -> bool:
-    """True if an error was raised by this package, and not by code that it called."""
     place = error.__traceback__
     while place is not None and place.tb_next is not None:
         place = place.tb_next
@@ -814,7 +797,6 @@ def _raised_here(error: BaseException) -> bool:
 
 
 def _warn_falling(solver: Solver) -> None:
-    """Warn if gravity acts on an object that nothing holds or stops."""
     falls = isinstance(solver, MPMSolver) and any(solver.gravity)
     if falls and all(isinstance(part, Impulse | RigidRegion) for part in solver.boundaries):
         warnings.warn(
@@ -848,7 +830,6 @@ class SceneEditor:
 
     @property
     def scene(self) -> SimulatedScene:
-        """The scene as it is now."""
         return self.stepper.scene
 
     def start(self) -> State:
@@ -863,14 +844,7 @@ class SceneEditor:
         return self.stepper.start()
 
     def edit(self, state: State, edits: Sequence[Edit]) -> State:
-        """Apply edits now, whatever their time; if one is not possible, nothing changes.
-
-        Args:
-            edits: The changes, in this order.
-
-        Returns:
-            The state from which the run continues.
-        """
+        """Apply edits now, whatever their time; all or nothing."""
         before = self.stepper.model, self.unedited, self.version
         try:
             return self._go_on(state, edits)
@@ -888,7 +862,6 @@ class SceneEditor:
         return state if resumed else edited
 
     def _go_on(self, state: State, edits: Sequence[Edit]) -> State:
-        """Apply edits; the internal variable of particles that get another law starts anew."""
         rest = self.apply(edits, flowed=True, running=True)
         if rest is None:
             return state
@@ -907,7 +880,7 @@ class SceneEditor:
         return sorted({edit.time for edit in self.edits})
 
     def reach(self, edit: Edit) -> tuple[Tensor, Tensor]:
-        """Return masks of the particles (P,) and of the Gaussians (N,) that an edit changes."""
+        """Masks of the particles (P,) and Gaussians (N,) that an edit changes."""
         scene, region, means = self.scene, edit.region, self.scene.model.means.detach()
         given = (scene.points.youngs_modulus, scene.points.poisson_ratio, scene.points.mass)
         if edit.of_material and any(value.requires_grad for value in given):
@@ -935,7 +908,6 @@ class SceneEditor:
         return particles, gaussians
 
     def reset(self) -> None:
-        """Restore the scene as it was before its first edit."""
         self.applied = 0
         if self.unedited is not None:
             scene, self.unedited = self.unedited.to(self.stepper.device), None
@@ -949,11 +921,6 @@ class SceneEditor:
         return found
 
     def apply(self, edits: Sequence[Edit], flowed: bool = False, running: bool = False) -> State | None:
-        """Apply edits to the scene.
-
-        Args:
-            running: As for :meth:`Stepper.take`, whose result is returned.
-        """
         scene = self.scene
         if edits and self.unedited is None:
             self.unedited = scene

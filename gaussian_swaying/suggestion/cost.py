@@ -77,7 +77,6 @@ def estimate_cost(
     Args:
         startup_seconds: Time to prepare the run [s], if known.
         budget: Time for the frames that are timed [s], about.
-        pictures: Whether pictures count, if the run makes some.
         cloud: All Gaussians that the run draws, if those of ``simulation`` are some of them.
     """
     solver, state, device = simulation.solver, simulation.start(), simulation.device
@@ -152,7 +151,7 @@ def _seconds(simulation: Simulation, work: Callable[[], object]) -> float:
 
 
 class Stopwatch:
-    """Time since it was created [s], without that to compile kernels for a CPU: the next run finds them."""
+    """Time since its creation [s], without compilation of kernels for a CPU, which the next run finds in a cache."""
 
     def __init__(self) -> None:
         self._begin = self._now()
@@ -168,7 +167,7 @@ class Stopwatch:
 
     @property
     def quiet(self) -> float:
-        """The smaller of wall-clock and processor time, to exclude the time used by other programs."""
+        """The smaller of wall-clock and processor time, which excludes the load of other programs."""
         return min(now - then for now, then in zip(self._now(), self._begin, strict=True))
 
     def on(self, device: torch.device) -> float:

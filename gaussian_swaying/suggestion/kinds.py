@@ -64,12 +64,11 @@ class Kind:
 
     @property
     def pivot(self) -> bool:
-        """True for what has a stem, a cord or ankles, which bend as easily along as across."""
+        """True for things with a stem, cord or ankles, which bend equally easily in both directions."""
         return not self.cloth and self is not KINDS["rigid"]
 
     @property
     def cloth(self) -> bool:
-        """True for a sheet, which is simulated by material points."""
         return self.frequency is None
 
 
@@ -106,12 +105,7 @@ def kind_of(own: Gaussians, up: Array, end: str, sheet: bool, names: list[str], 
     """Guess the kind of a thing.
 
     Args:
-        up: Up direction, a unit vector.
         end: Where it is held: ``top``, ``bottom``, ``side`` or ``none``.
-        leaf: Its leaves, if it has some.
-
-    Returns:
-        The name of the kind, and why, in words.
     """
     height, wide = own.means @ up, breadth(own.means, up, 0.02)
     low, high = corners(height)
@@ -154,7 +148,7 @@ def kind_of(own: Gaussians, up: Array, end: str, sheet: bool, names: list[str], 
 
 
 def with_materials(found: FoundParts, kind: Kind, height: float) -> FoundParts:
-    """The same parts with the densities, thicknesses and damping of their kind of thing.
+    """The parts with densities, thicknesses and damping typical of the kind.
 
     Leaves and cloth have that of a sheet. Stems and wood are rods of which the surface is seen, so their thickness is
     half of a radius: 3 mm for a stem, and a 120th of the height for wood, branches included. They get twice the

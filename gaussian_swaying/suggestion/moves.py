@@ -64,7 +64,7 @@ UPRIGHT = math.sin(math.radians(25))  # of the angle by which backdrops may be o
 
 @dataclass(frozen=True, eq=False)
 class Moving:
-    """The Gaussians to simulate.
+    """The choice of Gaussians to simulate.
 
     Attributes:
         simulated: Which they are, bool, shape (N,).
@@ -87,7 +87,7 @@ class Moving:
 
 @dataclass(frozen=True, eq=False)
 class Thing:
-    """Something that stands or hangs above the ground of a place.
+    """An object above the ground of a place.
 
     Attributes:
         members: Indices of its Gaussians, shape (M,).
@@ -102,7 +102,6 @@ class Thing:
 
     @property
     def score(self) -> float:
-        """How likely it is to be what should move."""
         return round(sum(self.reasons.values()), 2)
 
 
@@ -194,7 +193,7 @@ class Shown:
 
 
 def suggest_threshold(splat: Gaussians) -> float:
-    """The highest of ``THRESHOLDS`` that keeps at least ``KEPT_AREA`` of the visible area."""
+    """Highest of ``THRESHOLDS`` that keeps at least ``KEPT_AREA`` of the visible area."""
     kept = ((t, splat.weight[splat.opacity >= t].sum()) for t in THRESHOLDS)
     return next(t for t, area in kept if area >= KEPT_AREA * splat.weight.sum() or t == 0)
 
@@ -295,7 +294,7 @@ def without(box: Box, cuts: list[Region]) -> Region:
 
 
 def contains(region: Region, means: Array) -> Array:
-    """Which points are in a region, in the precision of a run."""
+    """Mask of the points in a region, in the precision of a run."""
     return region.contains(torch.from_numpy(means).float()).numpy()
 
 
@@ -318,7 +317,7 @@ def _padded(points: Array, margin: float) -> tuple[list[float], list[float]]:
 
 
 def nearby(points: Array, chosen: Array) -> Array:
-    """Which points (N, 3) are at most one longest side outside the box of those that are chosen, bool, shape (N,)."""
+    """Mask (N,) of points within one longest side of the box of the chosen ones."""
     low, high = points[chosen].min(0), points[chosen].max(0)
     side = (high - low).max()
     return ((points >= low - side) & (points <= high + side)).all(-1)
@@ -340,9 +339,6 @@ def survey(splat: Gaussians, up: Guess | None = None, cameras: Sequence[Camera] 
     - green, as leaves are (up to 1);
     - flat, as a cloth is (1);
     - in the photos: how much of it lies in them, on average (up to 2), if their cameras are known.
-
-    Args:
-        up: The up direction, if it was given.
 
     Returns:
         The parts, or None if it has no ground, or a single thing on a small one and no background: then it is an
@@ -397,21 +393,21 @@ def survey(splat: Gaussians, up: Guess | None = None, cameras: Sequence[Camera] 
 
 
 def sky(splat: Gaussians) -> Array:
-    """Gaussians that are far from the fine detail and as large as a quarter of it, or very far: a mask, shape (N,)."""
+    """Mask (N,) of Gaussians far from the fine detail and as large as a quarter of it, or very far."""
     middle, size = dense_part(splat[:: max(1, len(splat) // SAMPLE)])
     away, large = np.linalg.norm(splat.means - middle, axis=1), splat.scales[:, 1] > LARGE * size
     return ((away > FAR * size) & large | (away > VERY_FAR * size)) & (size > 0)
 
 
 def dense_part(splat: Gaussians) -> tuple[Array, float]:
-    """The middle of the fine half of the Gaussians, shape (3,), and its longest side without a tenth at each end."""
+    """Centre (3,) of the finer half of the Gaussians, and its longest side without a tenth at each end."""
     size = splat.scales[:, 0]
     fine = splat.means[size <= quantile(size, 0.5)]
     return np.median(fine, 0), extent(fine, 0.1)
 
 
 def move_things(place: Place, splat: Gaussians, numbers: Sequence[int]) -> tuple[Array, Moving]:
-    """The Gaussians at most one longest side away from some things, bool, shape (N,), and which of them move.
+    """Gaussians within one longest side of some things, bool, shape (N,), and which of them move.
 
     Args:
         numbers: Of the things, from 1 on.
@@ -513,7 +509,6 @@ def read_photos(path: Path, origin: Origin = NO_ORIGIN) -> Photos:
 
     Args:
         path: A transforms.json, a COLMAP model, or a folder that contains one.
-        origin: Point from which the places of the splat count.
     """
     cameras = [camera for _, camera in read_views(path, origin=origin)]
     eyes = np.array([camera.position.tolist() for camera in cameras])

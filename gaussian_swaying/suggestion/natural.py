@@ -46,7 +46,7 @@ TIP, LITTLE, MOST_CHANGE = 0.7, 0.02, 2.5
 
 @dataclass(frozen=True)
 class Natural:
-    """Numbers of a thing that sways as its kind does.
+    """Stiffness, mass and drag of a thing that sways as its kind does.
 
     Attributes:
         height: Height [m], or length from the pivot to the centre of mass of a hanging thing, that decides its
@@ -55,7 +55,7 @@ class Natural:
         mass: Mass of what moves [kg].
         frontal: Area of its silhouette in the wind [m²].
         thicker: Factor on the thicknesses of the surface.
-        stiffer: Young's moduli [Pa], by those before.
+        stiffer: New Young's moduli [Pa], keyed by the old ones.
         drag: Factor on the drag, friction and lift coefficients.
         coefficient: Drag coefficient of the whole on its silhouette.
         lean: Mean displacement of the upper tenth in the mean wind, over the longest side.
@@ -75,7 +75,7 @@ class Natural:
 
 
 def natural(simulation: Simulation, kind: Kind, flow: Tensor, intensity: float) -> Natural:
-    """Find the numbers of a kind for a scene, and give them to the simulation.
+    """Find stiffness, mass and drag for a kind, and apply them to the simulation.
 
     Args:
         flow: Mean wind [m/s], z up, shape (3,).
@@ -183,7 +183,6 @@ def _height(structure: Structure, free: Array, kind: Kind) -> float:
 def _stiffness(
     structure: Structure, modulus: Tensor, mass: float, thicker: float, frequency: float, kind: Kind
 ) -> dict[float, float]:
-    """Factors on the moduli, by their values: first the leaves on pinned stems, then the stems."""
     E = modulus.double().cpu().numpy()
     values = np.unique(E)
     target, load = (2 * math.pi * frequency) ** 2, structure.loads(0)[:, :2]
@@ -238,7 +237,6 @@ def _on_pinned_stems(structure: Structure, leaves: Any, soft: Array, target: flo
 
 
 def _drag(simulation: Simulation, frontal: float, flow: Tensor, kind: Kind) -> float:
-    """Factor on the coefficients that gives the whole the drag of its kind in a wind along a flow."""
     aero, position = simulation.aero, simulation.model.points.position
     still = torch.zeros_like(position)
     identity = torch.eye(3).to(still).expand(*still.shape, 3)
@@ -251,7 +249,6 @@ def _drag(simulation: Simulation, frontal: float, flow: Tensor, kind: Kind) -> f
 
 
 def _with_drag(aero: AeroForce, factor: float) -> AeroForce:
-    """The same force with other coefficients."""
     return changed(aero, **{name: factor * getattr(aero, name) for name in ("C_D", "C_F", "C_L")})
 
 

@@ -93,7 +93,7 @@ class FoundParts:
         return ", ".join(f"{part.name} {part.role} ({number:,} Gaussians)" for part, number in named)
 
     def within(self, of: Array) -> FoundParts:
-        """The same for a larger splat: ``of``, bool, shape (M,), are these, and the others are still."""
+        """The same parts in a larger splat: ``of``, bool, shape (M,), marks these Gaussians; the others are still."""
         parts = [*self.parts.parts, *([] if AROUND in self.names else [Part(AROUND, "still")])]
         labels = torch.full((len(of),), [part.name for part in parts].index(AROUND))
         labels[torch.from_numpy(of)] = self.parts.labels
@@ -101,7 +101,7 @@ class FoundParts:
 
 
 def labelled(splat: Gaussians, simulated: Array, size: float, found: Labels | None) -> FoundParts | None:
-    """The parts of a splat that have Gaussians.
+    """Parts of a splat, without those that have no Gaussians.
 
     What is near the object, or faint and touches it, goes with it; others are around.
 
@@ -202,7 +202,6 @@ def potted_plant(own: Gaussians, up: Array) -> Support | None:
 
 
 def _find_pot(across: Array, height: Array, weight: Array, green: Array) -> _Pot | None:
-    """The pot at the lower end, from slice to slice upwards; None if there is none."""
     slices = np.floor(height * SLICES)
     rings: list[tuple[float, Array, float]] = []
     missed = 0
@@ -238,7 +237,6 @@ def _find_pot(across: Array, height: Array, weight: Array, green: Array) -> _Pot
 
 
 def _ring(points: Array, weight: Array) -> tuple[Array, float] | None:
-    """Centre and radius of points around a circle, of which those inside do not count; None if it is none."""
     if len(points) < SECTORS:
         return None
     centre = np.average(points, 0, weight + 1e-300)
@@ -278,7 +276,6 @@ def _find_soil(across: Array, height: Array, share: Array, green: Array, pot: _P
 
 
 def _most_frequent(points: Array, label: Array) -> Array:
-    """The most frequent label among each point and its nearest neighbours."""
     from scipy.spatial import cKDTree
 
     if len(points) <= NEIGHBOURS:
@@ -288,7 +285,7 @@ def _most_frequent(points: Array, label: Array) -> Array:
 
 
 def woody(points: Array, green: Array, size: float) -> Array:
-    """True for stems, bool, shape (N,): not green, or, near by or farther around, longer than wide and not flat."""
+    """Mask (N,) of stems: not green, or locally longer than wide and not flat."""
     from scipy.sparse import coo_array
     from scipy.spatial import cKDTree
 
@@ -333,7 +330,6 @@ def pot_by_colour(own: Gaussians, up: Array) -> Labels | None:
 
 
 def _along_sheet(means: Array, up: Array) -> Array | None:
-    """The level direction in an upright sheet, a unit vector; None if most of its upper half is no such sheet."""
     normal = sheet_normal(means)
     if normal is None:  # a foot makes the whole no sheet, and ripples the cloth
         height = means @ up
@@ -420,7 +416,7 @@ def washing_line(own: Gaussians, up: Array) -> Support | None:
 
 
 def swinging(own: Gaussians, up: Array, hook: Region, cell: float) -> Labels:
-    """The parts of a thing that hangs: its upper end is held, a cord or neck below it bends, and the rest is rigid.
+    """Parts of a hanging thing: its upper end is held, a cord or neck below it bends, and the rest is rigid.
 
     Args:
         cell: Grid spacing [scene units].
@@ -435,7 +431,7 @@ def swinging(own: Gaussians, up: Array, hook: Region, cell: float) -> Labels:
 
 
 def standing(own: Gaussians, up: Array, depth: float) -> Labels | None:
-    """Find the trunk of a tree, narrow and not green, below a crown that is green; or the post of another thing.
+    """Find the trunk of a tree (narrow, not green, below a green crown), or the post of another thing.
 
     Its foot, of a depth [scene units], is held, wood and leaves are soft, or post and head; None if there is no such
     trunk or post.

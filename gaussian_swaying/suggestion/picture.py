@@ -63,7 +63,7 @@ def whole_box(splat: Gaussians, simulated: Array, outside: Array, cell: float) -
 
 
 def orbit_frame(whole: Sequence[Sequence[float]], moving: Sequence[Sequence[float]]) -> tuple[list[float], float]:
-    """Target and distance of an orbiting camera that shows all of an object.
+    """Target and distance of an orbit camera that shows the whole object.
 
     Args:
         whole: Corners of the box of the whole object [scene units].
@@ -245,7 +245,7 @@ def _view(simulation: Simulation, roles: Roles, camera: Camera, tints: Sequence[
 
 
 def roles_tinted(colours: Tensor, roles: Roles, tints: Sequence[tuple[str, Tensor, Colour]] = ()) -> Tensor:
-    """Colours (N, 3) with those of parts and of what is pushed or pinned, and grey where nothing moves."""
+    """Colours (N, 3) tinted by part, and by pushed or pinned; grey where nothing moves."""
     shown = [(mask, tinted(colours, tint, 0.4)) for _, mask, tint in tints]
     for mask, other in [*shown, (~(roles.simulated | roles.carried), greyed(colours))]:
         colours = torch.where(mask.to(colours.device)[:, None], other, colours)
@@ -256,7 +256,7 @@ def roles_tinted(colours: Tensor, roles: Roles, tints: Sequence[tuple[str, Tenso
 
 @torch.no_grad()
 def things_picture(cloud: GaussianCloud, place: Place, chosen: Sequence[int], device: torch.device) -> Array:
-    """The things of a place, each with its number, on what is around it in grey.
+    """Numbered pictures of the things of a place, with their surroundings in grey.
 
     Returns:
         8-bit RGB, shape (H, W, 3), up to four in a row.

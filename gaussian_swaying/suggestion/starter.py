@@ -9,7 +9,7 @@ from gaussian_swaying.suggestion.suggestion import Suggestion, configuration
 
 
 def write_starter(found: Suggestion, folder: Path, frames: int) -> list[str]:
-    """Write the configuration and its parts; others that are there are kept aside, as they may have been edited."""
+    """Write the configuration and its parts; keep earlier ones aside, as they may have been edited."""
     folder.mkdir(parents=True, exist_ok=True)
     parts = (folder / "parts.npz").resolve()
     assert found.path is not None
@@ -21,7 +21,7 @@ def write_starter(found: Suggestion, folder: Path, frames: int) -> list[str]:
 
 
 def keep_aside(path: Path, text: str) -> None:
-    """Rename a file that has another text, as it may have been edited: ``fit.yaml`` to ``fit.1.yaml``, and so on."""
+    """Rename a file with other content, as it may have been edited: ``fit.yaml`` to ``fit.1.yaml``, and so on."""
     if path.exists() and path.read_text(encoding="utf-8") != text:
         _rename(path)
 

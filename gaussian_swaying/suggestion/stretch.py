@@ -34,12 +34,12 @@ Motion = tuple[Array, Callable[[Array, int], Array]]
 
 
 def rate_for(frequency: float) -> float:
-    """Samples in a second of the record of a thing with a first frequency [Hz]."""
+    """Sampling rate [1/s] of the record for a first frequency [Hz]."""
     return min(max(PER_PERIOD * frequency, LEAST_RATE), RATE)
 
 
 class Response(NamedTuple):
-    """Slow complex vibrations of a tip, and what of a load on the modes each takes.
+    """Slow vibrations of a tip under loads on modes.
 
     Attributes:
         root: Their complex frequencies [1/s], shape (K,).
@@ -81,7 +81,6 @@ def linear_motion(bound: Modes, force: WindForce, wind: WindField, top: torch.Te
 
     Args:
         top: Share of each site in the top, shape (S,).
-        rate: Samples in a second.
     """
     from scipy.cluster.vq import kmeans2
 
@@ -107,12 +106,11 @@ def linear_motion(bound: Modes, force: WindForce, wind: WindField, top: torch.Te
 
 
 def cloth_motion(wind: WindField, places: torch.Tensor, frequency: float, ratio: float) -> Motion:
-    """Motion of one oscillator along each axis in the mean wind of some places, as that of a hanging cloth.
+    """Motion of a hanging cloth as one oscillator per axis, in the mean wind of some places.
 
     Args:
         places: Places [m], shape (K, 3).
         frequency: Frequency [Hz].
-        ratio: Damping ratio, with that of the air.
     """
     rate, omega = rate_for(frequency), 2 * math.pi * frequency
     push = _pressed(_air(wind, places.double().cpu().numpy(), rate, SAMPLES, 0).mean(1))
@@ -195,7 +193,6 @@ def _motion(load: Array, response: Response, rate: float) -> Motion:
 
 
 def _fault(value: Any, allowed: tuple[float, float, float]) -> Any:
-    """One for a value outside its range by the last number or more, and a little more the farther it is."""
     low, high, size = allowed
     apart = np.maximum(np.maximum(low - value, value - high), 0.0) / size
     return np.minimum(apart, 1.0) + 0.5 * apart

@@ -101,9 +101,6 @@ def suggest(
         device: Of the simulation.
         tune: Whether stiffness, mass and drag are made those of its kind, which takes seconds; if not, they are first
             guesses.
-
-    Returns:
-        The suggestion.
     """
     begin = Stopwatch()
     path = None if isinstance(splat, GaussianCloud) else Path(splat).resolve()
@@ -257,7 +254,7 @@ def suggest(
 
 
 def tuned(s: Suggestion, device: str) -> Suggestion:
-    """The suggestion with the numbers of its kind, a typical stretch of its wind, and its simulation."""
+    """The suggestion with stiffness, mass and drag of its kind, a typical stretch of wind, and its simulation."""
     kind, begin = KINDS[s.kind], Stopwatch()
     leafy = s.kind in ("plant", "succulent")  # whose leaves are seen one by one
     simulation = replace(s, connected="surface" if leafy else "grid").to_simulation(device)
@@ -290,13 +287,12 @@ def tuned(s: Suggestion, device: str) -> Suggestion:
 
 
 def why_apart(scene: SimulatedScene, dx: float, held: Tensor) -> str | None:
-    """The reason for nodes of their own, in words; None if parts should share them.
+    """The reason for separate nodes per part (``connected: surface``), in words; None if parts should share nodes.
 
     They should not share them if much lies beside what it is not attached to, and all hangs together with what is held:
     what does not would fall, though a grid may hold it.
 
     Args:
-        dx: Grid spacing [m].
         held: Which Gaussians are held, bool, shape (N,).
     """
     assert scene.pairs is not None
@@ -311,7 +307,6 @@ def why_apart(scene: SimulatedScene, dx: float, held: Tensor) -> str | None:
 
 
 def _check_extent(points: Array) -> None:
-    """Raise ValueError if points are all one."""
     if extent(points, 0.0) <= 0:
         raise ValueError("All Gaussians of the object are at one point: there is nothing to simulate.")
 

@@ -125,7 +125,6 @@ class Suggestion:
 
     @property
     def fixed(self) -> bool:
-        """True if something holds it."""
         return self.pin is not None or self.parts is not None
 
     @property
@@ -135,18 +134,17 @@ class Suggestion:
 
     @property
     def sways(self) -> bool:
-        """True if its numbers are those of its kind: it is held, no cloth, and no material was given."""
+        """True if its numbers are its kind's: it is held, is no cloth, and no material was given."""
         return self.fixed and not self.real and not KINDS[self.kind].cloth
 
     @property
     def by_modes(self) -> bool:
-        """True if modes will do: it leans by less than :data:`MOST_LEAN`, or turns as one, which modes do exactly."""
+        """True if modes suffice: it leans by less than :data:`MOST_LEAN`, or turns rigidly, which is exact."""
         little = self.natural is None or self.natural.lean < MOST_LEAN or self.kind == "hanging"
         return self.sways and little
 
     @property
     def why_formulation(self) -> str:
-        """The reason why it sways by modes or by material points, in words."""
         if self.by_modes:
             how = "turns as one" if self.kind == "hanging" else "leans by less than 40 %"
             return f"it is held, nothing touches, and it {how}"
@@ -158,7 +156,6 @@ class Suggestion:
 
     @property
     def reasons(self) -> dict[str, str]:
-        """What was guessed and why, in sentences by name."""
         return reasons_of(self)
 
     def picture(self, height: int = 540) -> Array:
@@ -171,7 +168,6 @@ class Suggestion:
         return None if self.place is None else things_picture(self.cloud, self.place, self.moves, device)
 
     def to_simulation(self, device: str = "auto") -> Simulation:
-        """The simulation."""
         parser = Simulation.parser()
         with TemporaryDirectory() as folder:
             text = self.to_yaml(Path(folder) / "starter.yaml", splat=self.path or Path("splat.ply"))
@@ -188,9 +184,6 @@ class Suggestion:
         Args:
             file: The configuration; Gaussians without a file of their own are written beside it.
             splat: The file of the Gaussians that it names; ``path`` if None.
-
-        Returns:
-            Its text.
         """
         folder = Path(file).resolve().parent
         splat = splat or self.path
@@ -205,7 +198,7 @@ class Suggestion:
 
 
 def reasons_of(s: Suggestion) -> dict[str, str]:
-    """What was guessed and why, in sentences by name; what follows a semicolon is a further reason."""
+    """What was guessed and why: sentences by name. Further reasons follow a semicolon."""
     moving, held = s.moving, s.hold
     region = "all of space" if moving.box is None else json.dumps(dict(zip(("min", "max"), moving.box, strict=True)))
     found = {
@@ -250,7 +243,7 @@ def hold_word(s: Suggestion) -> str:
 
 
 def things_lines(s: Suggestion) -> list[str]:
-    """The parts of a capture of a place, and how other things are chosen."""
+    """Lines on the parts of a capture of a place, and how to choose other things."""
     if s.place is None:
         return []
     lines = [
@@ -281,7 +274,7 @@ def cost_lines(cost: Cost) -> list[str]:
 
 
 def run_lines(simulation: Simulation) -> list[str]:
-    """What a configuration simulates, holds and blows."""
+    """Lines on what a configuration simulates, where it is held, and its wind."""
     scene, roles = simulation.scene, classify(simulation)
     regions = [repr(b.region) for b in conditions(simulation) if hasattr(b, "region")]
     mass, area = float(scene.points.mass.sum()), float(scene.patches.area.sum())
@@ -302,7 +295,7 @@ def run_lines(simulation: Simulation) -> list[str]:
 
 
 def as_plain(value: Any) -> Any:
-    """What JSON keeps of a part of a suggestion: of a mask the number of its Gaussians, and of others."""
+    """JSON form of a part of a suggestion; a mask becomes its number of Gaussians."""
     if isinstance(value, Region):
         return region_dict(value)
     if isinstance(value, np.ndarray):
@@ -381,9 +374,6 @@ def region_dict(region: Region) -> dict[str, Any]:
 
 def configuration(s: Suggestion, splat: Path, parts: Path, frames: int) -> str:
     """The configuration as text.
-
-    Args:
-        parts: That of its parts, if it has some.
 
     Returns:
         YAML for ``--config`` of a simulation.
@@ -509,7 +499,6 @@ def _solver_damping(s: Suggestion) -> str:
 
 
 def _kind(s: Suggestion) -> str:
-    """Return the kind of a pin, with the reason as a comment: that of its shape for a sheet, nodes else."""
     if s.sheet:
         return "null              # points: a hinge, or a clamp if it is too thick there; `updated` needs nodes"
     return (
@@ -529,7 +518,6 @@ def _connected(s: Suggestion) -> str:
 
 
 def _padded(text: str, width: int) -> str:
-    """Text padded with blanks to a width, with at least one blank."""
     return f"{text:<{width - 1}} "
 
 

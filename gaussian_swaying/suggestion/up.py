@@ -31,7 +31,7 @@ PROGRAMS = {"+z": "z is up in Blender", "-y": "y is down in COLMAP", "+y": "y is
 
 
 def wind_words(flow: Sequence[float], up: Sequence[float]) -> str:
-    """A flow in words: with z up, as in ``wind.flow``, and in scene axes, as regions are, if z is not up in them.
+    """A flow in words, with z up and, if z is not up in the scene, also in scene axes.
 
     Args:
         flow: Velocity [m/s], z up.
@@ -127,5 +127,5 @@ def given_up(up: Sequence[float] | str) -> Guess:
 
 
 def camera_words(guess: Guess) -> tuple[str, ...]:
-    """The values of ``--up`` for a direction and the opposite one."""
+    """Values of ``--up`` for a direction and its opposite."""
     return tuple(" ".join(f"{sign * c + 0.0:.4g}" for c in guess.direction) for sign in (1.0, -1.0))

@@ -48,9 +48,6 @@ def write_shards(
     Args:
         output: Folder of the files; ``shards`` in the folder of the sweep if None.
 
-    Returns:
-        The files.
-
     Raises:
         ValueError: If the folder is not a sweep, none of its runs is complete, or something was not recorded.
     """
@@ -105,7 +102,6 @@ def write_shards(
 
 
 def _numbers(value: Any) -> list[float]:
-    """The numbers in a value, nested lists flattened; empty if it contains anything else."""
     if isinstance(value, Real):
         return [float(value)]
     parts = [_numbers(item) for item in value] if isinstance(value, list) else []

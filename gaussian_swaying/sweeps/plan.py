@@ -226,11 +226,7 @@ def make_plan(sweep: Sweep, parser: ArgumentParser | None = None) -> Plan:
 
 
 def parse_run(parser: ArgumentParser, config: str, frames: int, run: Mapping[str, Any]) -> Namespace:
-    """The settings of one run.
-
-    Args:
-        config: Configuration that all runs share, as YAML.
-    """
+    """The settings of one run."""
     # parameters that are no options
     own = {n: v for n, v in run.items() if n in POLAR or n.startswith(("forces.", "wind.modulations."))}
     options = [option(name, value) for name, value in {"frames": frames, **run}.items() if name not in own]

@@ -136,11 +136,7 @@ def failure(status: str, reason: str, attempt: int) -> dict[str, Any]:
 
 
 def write_tables(folder: Path, plan: Plan, results: Mapping[str, Any], parquet: bool = False) -> None:
-    """Write ``sweep.csv``, a row per run in their order; and ``sweep.parquet`` with numbers and lists as such.
-
-    Args:
-        parquet: Whether to write the second.
-    """
+    """Write ``sweep.csv``, a row per run in their order; and ``sweep.parquet`` with numbers and lists as such."""
     rows = []
     for name, run in zip(plan.names, plan.runs, strict=True):
         result = results.get(name) or {"status": "missing"}

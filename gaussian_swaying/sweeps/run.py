@@ -83,7 +83,6 @@ class Job:
 
     @property
     def wanted(self) -> tuple[str, ...]:
-        """Names of the runs without the complete ones."""
         return tuple(name for name in self.names if name not in self.complete)
 
     def apart(self) -> list[Job]:
@@ -113,7 +112,7 @@ def _parser() -> ArgumentParser:
 
 
 def work(job: Job, threads: int, explain: Explain, where: str = platform.node()) -> Outcome:
-    """Do a job in a worker and write the results of its complete runs; those of failures are not written yet.
+    """Do a job in a worker and write the results of its complete runs; the caller writes those of failures.
 
     Args:
         explain: Makes a sentence of an error; a function of a module.
@@ -153,7 +152,6 @@ def _lost(job: Job, reason: str) -> Outcome:
 
 
 def _unlocked(do: Callable[[], Any]) -> Any:
-    """Do what needs a folder, once it is free."""
     begin = time.monotonic()
     while True:
         try:
@@ -165,7 +163,7 @@ def _unlocked(do: Callable[[], Any]) -> Any:
 
 
 def run_alone(job: Job) -> dict[str, dict[str, Any]]:
-    """Do the only run of a job; its summary by its name."""
+    """Do the only run of a job; returns its summary by name."""
     (name,), (run,) = job.names, job.runs
     settings = parse_run(_parser(), job.config, job.frames, run)
     settings.device = job.device
@@ -209,7 +207,7 @@ def grouped(runs: Sequence[Mapping[str, Any]], size: int) -> list[list[int]]:
 
 
 def run_together(job: Job) -> dict[str, dict[str, Any]]:
-    """Do the runs of a job in one rollout; the summaries of those that are wanted by name."""
+    """Do the runs of a job in one rollout; returns the wanted summaries by name."""
     members = members_of(job)
     folders = [None if name in job.complete else job.folder / RUNS / name for name in job.names]
     extras = [{"sweep": {"run": n, "settings": r}} for n, r in zip(job.names, job.runs, strict=True)]
@@ -218,7 +216,7 @@ def run_together(job: Job) -> dict[str, dict[str, Any]]:
 
 
 def members_of(job: Job) -> list[Simulation]:
-    """The simulations of all runs of a job; the parser makes the first one, as it takes longer than a frame of all."""
+    """Simulations of all runs of a job; only the first is parsed, as that takes longer than a frame."""
     import yaml
 
     settings = parse_run(_parser(), job.config, job.frames, job.runs[0])
@@ -316,7 +314,6 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _without_ctrl_c() -> Iterator[None]:
-    """Block Ctrl-C for the processes that are started in the block; here it acts after the block."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return

@@ -185,7 +185,6 @@ class DefaultDensification(Densification):
         }
 
     def make_strategy(self, device: torch.device) -> Any:
-        """``gsplat.DefaultStrategy`` with these options; on several devices with the gradients of all."""
         return _default_strategy()(**self._in_steps(self._options))
 
     def _initial_state(self, scene_scale: float) -> dict[str, Any]:
@@ -324,5 +323,4 @@ class MCMCDensification(Densification):
             self._strategy.step_post_backward(parameters, self._optimizers, self._state, step, screen.info(), lr=rate)
 
     def state_dict(self) -> dict[str, Any]:
-        """Empty: its table of binomials is computed again."""
         return {}

@@ -45,7 +45,6 @@ class TrainCLI(LightningCLI):
         parser.set_defaults({f"checkpoint.{name}": value for name, value in CHECKPOINT_DEFAULTS.items()})
 
     def _chosen(self, config: Namespace) -> Namespace:
-        """The part of a configuration that belongs to the subcommand."""
         part: Namespace = config.get(str(self.subcommand), config)
         return part
 
@@ -99,7 +98,6 @@ class TrainCLI(LightningCLI):
                 raise ValueError(f"{path} {told}") from error
 
     def after_fit(self) -> None:
-        """Refuse a run that trained on nothing."""
         if not self.run_folder.begun:
             done, wanted = (n * self.trainer.world_size for n in (self.trainer.global_step, self.trainer.max_steps))
             raise ValueError(

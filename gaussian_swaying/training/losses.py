@@ -87,7 +87,7 @@ class LossTerm(nn.Module, ABC):
     needs: frozenset[str] = frozenset()
 
     def share(self, step: int) -> float:
-        """Return the factor on its weight at a step; 0 where it is not computed."""
+        """Factor on the weight at a step; 0 if the term is not computed then."""
         if step < self.start or (step - self.start) % self.every:
             return 0.0
         if self.stop is None:
@@ -266,16 +266,13 @@ class TotalLoss(nn.Module):
         self.terms = nn.ModuleDict(self._by_name)
 
     def active(self, step: int) -> dict[str, LossTerm]:
-        """The terms that are computed at a step, by name."""
         return {name: term for name, term in self._by_name.items() if term.share(step)}
 
     def needs(self, step: int) -> frozenset[str]:
-        """Return the inputs that the active terms need, see :data:`NEEDS`."""
         wanted: frozenset[str] = frozenset()
         return wanted.union(*(term.needs for term in self.active(step).values()))
 
     def forward(self, inputs: LossInputs) -> tuple[Tensor, Mapping[str, Tensor]]:
-        """The sum, with its gradient, and each active term before its weight, detached."""
         terms = self.active(inputs.step)
         values = {name: term(inputs) for name, term in terms.items()}
         for name, value in values.items():

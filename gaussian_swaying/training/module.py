@@ -219,9 +219,6 @@ class SplatTrainer(lightning.LightningModule):
             background: Colour behind them, shape (3,); black when None.
             degree: Degree of the harmonics in use; all when None.
             surface: Whether to blend the channels that :func:`~gaussian_swaying.rendering.planes.surface_maps` needs.
-
-        Returns:
-            The picture.
         """
         splat = self.splat
         degree = self.sh_degree if degree is None else degree
@@ -302,7 +299,6 @@ class SplatTrainer(lightning.LightningModule):
         return camera, surface_maps(output.channels, output.alpha, camera)
 
     def _other_view(self, batch: Mapping[str, Any], background: Tensor | None) -> OtherView | None:
-        """Another training image of the same place with its surface; None if there is none."""
         datamodule: Any = getattr(self.trainer, "datamodule", None)
         if not hasattr(datamodule, "other_view"):
             raise ValueError(
@@ -423,7 +419,6 @@ class SplatTrainer(lightning.LightningModule):
             write_panel(pictures, folder, f"{stage}_{batch_idx:02d}", images, self.trainer.loggers)
 
     def _degree_reached(self) -> int:
-        """Degree in use when the checkpoint was written; the full degree without a checkpoint."""
         return self.sh_degree if self._seen == 0 else self.active_degree(self._seen - 1)
 
     # ---- the end

@@ -101,7 +101,6 @@ def means_rate(rates: LearningRates, scene_scale: float, step: int, max_steps: i
 
     Args:
         scene_scale: Extent of the scene [scene units].
-        step: Number of steps before.
 
     Returns:
         The rate [scene units].

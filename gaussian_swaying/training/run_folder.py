@@ -41,7 +41,6 @@ class RunFolder(Callback):
         self._lock: FolderLock | None = None
 
     def on_train_start(self, trainer: Any, pl_module: Any) -> None:
-        """Take the folder: the data, the checkpoint and the settings have been read."""
         root, first = Path(trainer.default_root_dir), trainer.is_global_zero
         try:
             if first:  # of several processes

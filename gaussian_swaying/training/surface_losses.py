@@ -53,7 +53,7 @@ def sample(image: Tensor, pixel: Tensor) -> Tensor:
 
 
 def round_trip(pixel: Tensor, depth: Tensor, camera: Camera, other: OtherView) -> tuple[Tensor, Tensor]:
-    """Return the reprojection error of pixels: to another view and back, each time by the rendered surface.
+    """Reprojection error of pixels: to another view and back, by the rendered surfaces.
 
     Args:
         pixel: Pixel coordinates, shape (S, 2).
@@ -84,7 +84,7 @@ def _lift(pixel: Tensor, camera: Camera) -> Tensor:
 def warped_patches(
     pixel: Tensor, normal: Tensor, distance: Tensor, camera: Camera, other: OtherView, radius: int
 ) -> tuple[Tensor, Tensor]:
-    r"""Grey values of another view where patches of a plane appear in it.
+    r"""Grey values of another view at warped patches.
 
     A pixel :math:`u` near the centre of a patch lies on the plane :math:`n \cdot x = d` of that centre, at
     :math:`x = d\, r(u) / (n \cdot r(u))`: the homography of the plane, written with rays.
@@ -295,7 +295,7 @@ def weighted_mean(values: Tensor, weight: Tensor) -> Tensor:
 
 
 def surface_of(inputs: LossInputs) -> tuple[SurfaceMaps, Camera]:
-    """The surface and the camera of a training step."""
+    """Surface maps and camera of a training step."""
     if inputs.surface is None or inputs.camera is None:
         raise ValueError("This loss needs `LossInputs.surface` and `LossInputs.camera`: pass both.")
     return inputs.surface, inputs.camera

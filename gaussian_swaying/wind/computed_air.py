@@ -111,7 +111,6 @@ class ComputedAir(Fixed, nn.Module):
         return max(b - a for a, b in zip(self.low, self.high, strict=True)) / self.cells
 
     def counts(self) -> tuple[int, int, int]:
-        """Cells along x, y and z, with those within the ground."""
         sides = [math.ceil((b - a) / self.spacing - 1e-6) for a, b in zip(self.low, self.high, strict=True)]
         return sides[0], sides[1], sides[2] + self.ground
 
@@ -144,7 +143,7 @@ class AirPush(Force):
         self.numbers[:, 3] = rate
 
     def written(self) -> None:
-        """Tell who keeps a copy of the numbers that they changed: a replayed graph writes them unseen."""
+        """Bump the version of ``numbers``, which a replayed graph changes without torch's knowledge."""
         torch.autograd.graph.increment_version(self.numbers)
 
     def taken(self, way: Tensor, faster: Tensor, substeps: int, dt: float) -> Tensor:
@@ -216,7 +215,6 @@ def resolution(settings: ComputedAir, wind: WindField, frame_dt: float, position
     """Cost of a box, and the Reynolds number that it resolves.
 
     Args:
-        frame_dt: Length of a frame [s].
         position: Points of the body at rest [m], shape (P, 3).
     """
     speed, length = speed_of(settings, wind), float((position.amax(0) - position.amin(0)).amax())
@@ -419,7 +417,7 @@ class AirInBox:
         return state, last.clone() if self._pair else last, torch.stack(seen).amax()
 
     def _sets(self, moments: Tensor) -> list[Tensor]:
-        """Two sets of moments for the steps of a frame; on a GPU always the same ones."""
+        """On a GPU always the same tensors, as recordings keep their addresses."""
         if moments.is_cuda and not self._pair:
             with torch.inference_mode(False):
                 self._pair = [torch.empty_like(moments) for _ in range(2)]
@@ -447,7 +445,6 @@ class AirInBox:
         return taken
 
     def _end(self, now: Tensor, out: Tensor, substeps: int, dt: float, *given: Tensor) -> list[Tensor]:
-        """End a step: the air loses what the body took, and moves on under the last given, the wind at the faces."""
         self._lose(now, substeps, dt, *given[:-1])
         self.flow.advance(now, out, given[-1])
         return []

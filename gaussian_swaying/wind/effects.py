@@ -110,12 +110,12 @@ class WindEffect(Component, nn.Module):
         return self
 
     def along(self, flow: Tensor) -> WindEffect:
-        """The same effect in a flow at the start [m/s], shape (3,), on the CPU; called when a wind is made."""
+        """The effect for an initial flow [m/s], shape (3,), on the CPU; called when a wind is made."""
         return self
 
 
 def blown(device_function: DeviceFunction, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
-    """The device function of an effect on tensors, as :meth:`WindEffect.forward`."""
+    """Evaluate an effect's device function on tensors, as :meth:`WindEffect.forward`."""
 
     def numbers(given: Any) -> tuple[Any, ...]:
         return tuple(given.to(position).reshape(-1).unbind()) if isinstance(given, Tensor) else tuple(given)
@@ -131,7 +131,7 @@ def blown(device_function: DeviceFunction, velocity: Tensor, position: Tensor, m
 
 
 def placed(frame: SimFrame, point: Sequence[float]) -> list[float]:
-    """A point in scene units in metres, z up."""
+    """A point converted from scene units to metres, z up."""
     found: list[float] = frame.point_to_sim(torch.tensor([list(point)], dtype=torch.float64))[0].tolist()
     return found
 
@@ -241,7 +241,6 @@ ROUND_GROWTH = tl.constexpr(0.05)
 
 @triton.jit
 def _direction(flow):
-    """Unit vector of a flow, zero in still air, and its speed."""
     speed = tl.sqrt(dot3(flow, flow))
     scale = 1 / tl.maximum(speed, 1e-12)
     return scale3(scale, flow), speed
@@ -431,7 +430,6 @@ def wake_start(drag: float) -> float:
 
 
 def _turned(frame: SimFrame, axes: Any) -> Any:
-    """Directions, as lists, in the axes of a simulation."""
     return frame.direction_to_sim(torch.tensor(axes, dtype=torch.float64)).tolist()
 
 

@@ -84,7 +84,7 @@ def _sample(time, interval):
 
 @triton.jit
 def swayed(v, time, numbers, start):
-    """``SineSway``; as the others, of a velocity, the time, its numbers and the start of its stream."""
+    """``SineSway``; arguments as for all modulations: velocity, time, numbers, start of the random stream."""
     sway = 1 + numbers[0] * tl.sin(6.283185307179586 * time / numbers[1] + numbers[2])
     first = (tl.abs(v[0]) >= tl.abs(v[1])) & (tl.abs(v[0]) >= tl.abs(v[2]))
     second = tl.abs(v[1]) >= tl.abs(v[2])
@@ -261,7 +261,6 @@ def flow_rows(name: str, flows: Sequence[VectorLike]) -> Tensor:
     """Flows [m/s] as one tensor, shape (K, 3), float64, with the gradients that are required.
 
     Args:
-        name: Name of the argument, for messages.
         flows: K flows, each a tensor of shape (3,), or three numbers of which some may be tensors.
     """
     rows = [_row(name, flow) for flow in flows]
@@ -379,7 +378,6 @@ class WindField(Fixed, nn.Module):
 
     @property
     def _known(self) -> bool:
-        """Whether its numbers can be those of several scenes."""
         parts = all("numbers" in vars(type(part)) for part in self.modulations)
         return type(self) is WindField and self.uniform and isinstance(self.seed, int) and parts
 
@@ -411,7 +409,7 @@ class WindField(Fixed, nn.Module):
         return changed(self, effects=effects, _in_metres=True)
 
     def with_flow(self, flow: VectorLike) -> WindField:
-        """The same wind with another steady flow [m/s], in place of a schedule, too; a tensor keeps its gradient."""
+        """The wind with another steady flow [m/s] instead of its flow or schedule; a tensor keeps its gradient."""
         return changed(self, flows=flow_rows("flow", [flow]), times=self.times.new_zeros(1))
 
     def _keys(self, time: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -469,7 +467,7 @@ class WindField(Fixed, nn.Module):
         return self.shaped(self(time), position, Moment(time, self.mean_flow(time), self.carried(time)))
 
     def shaped(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
-        """Return the velocity at some places: the effects applied to one that is the same everywhere.
+        """Apply the effects to a uniform velocity at some places.
 
         Args:
             velocity: Velocity with modulations [m/s], shape (3,).
@@ -512,7 +510,6 @@ class WindField(Fixed, nn.Module):
         return velocity
 
     def _known_rows(self, time: Tensor) -> bool:
-        """Whether a kernel knows all modulations; not while a graph is recorded, if their numbers are not there yet."""
         parts = all("function" in vars(type(part)) for part in self.modulations)
         if not (len(self.modulations) and parts and type(self) is WindField and self.flows.dtype == torch.float64):
             return False
@@ -558,7 +555,6 @@ def _seeds(seeds: Sequence[int], like: Tensor) -> Tensor:
 
 
 def _with_buffers(module: M, **tensors: Tensor) -> M:
-    """A copy of a module with tensors in place of numbers."""
     other = changed(module)
     for name in tensors:
         vars(other).pop(name, None)

@@ -58,7 +58,7 @@ LAWS = ("paper", "projected", "linear", "cross_flow")
 
 @triton.jit
 def drag_speed(air, relative, LAW: tl.constexpr):
-    """Speed that the drag is proportional to, besides that of the flow along a patch: that of the wind if linear."""
+    """The speed factor of drag, besides the flow along the patch: that of the wind in the linear law."""
     found = dot3(relative, relative)
     if LAW == 2:
         found = dot3(air, air)
@@ -142,10 +142,9 @@ def shaped_wind(position, now, table, EFFECTS: tl.constexpr):
 
 @triton.jit
 def add_direction(s, q, b, w, LAW: tl.constexpr):
-    """Add the area vector b to two sums.
+    """Add the area vector b of one direction to two sums.
 
-    They are those of signed vectors, and (LAW 3) of b times the flow through it per
-    area, times the size of that flow.
+    ``s`` gets sign(b w) b; in LAW 3, ``q`` gets sign(b w) (b w)² b / b².
     """
     along = dot3(b, w)
     sign = tl.where(along < 0, -1.0, 1.0)
@@ -197,7 +196,6 @@ def flow_adjoint(table, place, w, by_q):
 
 
 def _sums(patches: PatchSums, place: Any, w: tuple[Tensor, ...], LAW: int) -> Any:
-    """:func:`sums_over_patches` of tensors (P,)."""
     point, count, zero = patches.point, len(patches.tensor), (0.0, 0.0, 0.0)
     own = tuple(part.expand(count)[point] for part in w)
     terms = on_tensors(add_direction)(zero, zero, patches.vector.unbind(-1), own, LAW)
@@ -521,7 +519,7 @@ class AeroForce(Fixed, nn.Module):
 
 @triton.jit
 def air_push(F, velocity, position, point, numbers, now, table, OPTIONS: tl.constexpr):
-    """A force at rest less a rate times the velocity; ``point``: the force (3) and the rate."""
+    """Device function: a force at rest minus a rate times the velocity; ``point``: force (3) and rate."""
     return add3(point, -point[3], velocity), point[3] * 0.0
 
 
@@ -589,9 +587,8 @@ class WindForce(Force):
         normal: Unit normals of the patches at rest, one for each particle, shape (..., P, 3); or any number of
             :class:`~gaussian_swaying.wind.patches.Patches`, those of the scenes of a batch one after the other.
         area: Their areas at rest [m²], shape (..., P); zero for particles that feel no wind. None with ``Patches``.
-        places: Where copies of an object stand in one wind, each simulated as if it stood at the place of the original:
-            a module with ``turn``, the rotations to the axes of the wind, shape (B, 3, 3), ``shift`` [m], shape (B, 3),
-            and ``delay`` of the wind [s], shape (B,).
+        places: Positions of copies, which are simulated at the place of the original: a module with ``turn``, rotations
+            to the axes of the wind, shape (B, 3, 3), ``shift`` [m], shape (B, 3), and ``delay`` [s], shape (B,).
 
     Attributes:
         normal: Unit normals at rest, shape (..., P, 3).
@@ -708,7 +705,7 @@ class WindForce(Force):
         return found if self.places is None else found @ self.places.turn.to(position)
 
     def samples(self, state: State, dt: float, steps: int) -> Tensor:
-        """Air velocity [m/s] at the particles of a state, at ``steps`` times, ``dt`` [s] apart, starting at its time.
+        """Air velocity [m/s] at a state's particles, at ``steps`` times, ``dt`` [s] apart, starting now.
 
         Returns:
             Shape (steps, ...), broadcastable to (steps, ..., P, 3) from its second axis on.

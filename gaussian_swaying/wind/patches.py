@@ -33,7 +33,7 @@ _COARSE = (0.5,)
 
 
 class Patches(nn.Module):
-    """Surface patches that feel the wind, and the material points that they belong to.
+    """Surface patches and the material points that carry them.
 
     Args:
         normal: Unit normals at rest, of either sign, shape (Q, 3).
@@ -94,7 +94,6 @@ class PatchSums(nn.Module):
 
         Args:
             group: The group of each point, shape (P,).
-            coarse: As in the constructor.
         """
         length = self.vector.norm(dim=-1)
         normal = self.vector / length[:, None].clamp(min=torch.finfo(length.dtype).tiny)
@@ -112,13 +111,13 @@ class PatchSums(nn.Module):
         return len(self.vector) + 2 * len(self.tensor)
 
     def lists(self) -> Tensor:
-        """First row of each point in the :meth:`table`, and its number of vectors, shape (P, 2)."""
+        """First row and number of vectors of each point in the :meth:`table`, shape (P, 2)."""
         count = self.point.bincount(minlength=len(self.tensor))
         first = count.cumsum(0) - count + 2 * torch.arange(len(count), device=count.device)
         return torch.stack([first, count], -1).to(self.tensor)
 
     def table(self) -> Tensor:
-        """For each point two rows with the six numbers of its tensor, and a row for each vector; shape (4 rows,)."""
+        """Patch sums for the kernels: per point two rows for its tensor, then one per vector; shape (4 rows,)."""
         first = self.lists()[:, 0].long()
         found = self.tensor.new_zeros(self.rows, 4)
         upper = self.tensor[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]

@@ -74,10 +74,11 @@ def look_up(table, sizes, place, OPTIONS: tl.constexpr):
 
 @triton.jit
 def tabulated(v, x, numbers, now, table, OPTIONS: tl.constexpr):
-    """``Tabulated``; ``numbers``: from places to cells (9), from the axes of the table (9), its sizes (3).
+    """Device function of ``Tabulated``: looks a table of velocities or factors up, and applies it.
 
-    ``now``: place of the origin [cells] (3) and factor; of a table for each time also the numbers of two and the share
-    of the second. ``OPTIONS``: whether it repeats along each axis (3), values of a corner, whether it has times.
+    ``numbers``: matrix from places to cells (9), matrix from the axes of the table (9), its sizes (3). ``now``: origin
+    [cells] (3) and factor; with a table for each time also the indices of two tables and the weight of the second.
+    ``OPTIONS``: whether it repeats along each axis (3), values per corner, whether it has times.
     """
     p = add3(matvec(numbers, x), 1.0, now)
     sizes = chosen(numbers, 18, 3)
@@ -97,7 +98,7 @@ def tabulated(v, x, numbers, now, table, OPTIONS: tl.constexpr):
 
 
 def wind_axes(flow: Tensor) -> Tensor:
-    """Axes with the first along a flow and the second horizontal, as rows, shape (3, 3), without making the host wait.
+    """Axes as rows, shape (3, 3): the first along a flow, the second horizontal; the host does not wait.
 
     Args:
         flow: The flow [m/s], shape (3,); x if it is zero.
@@ -111,7 +112,7 @@ def wind_axes(flow: Tensor) -> Tensor:
 
 
 class Tabulated(WindEffect, ABC):
-    """Base of effects whose values are in a table: velocities that are added, or shares of the velocity that are left.
+    """Base of effects in a table of added velocities, or of factors on the velocity.
 
     Args:
         table: Values at the corners of its cells, along its own axes, shape (X, Y, Z, 3), or (X, Y, Z, 1) for shares;
@@ -229,11 +230,10 @@ class CarriedField(Tabulated):
     start: Tensor
 
     def along(self, flow: Tensor) -> WindEffect:
-        """The field with its x axis turned into the flow."""
         return changed(self, axes=box_axes(flow.detach().cpu(), (self.sizes * self.step).tolist(), self.tilted))
 
     def now(self, moment: Moment) -> Tensor:
-        """The place of the object's centre in the field, in its first period where it repeats, and the strength."""
+        """Position of the object's centre in the field, within its first period, and the strength."""
         place = self.anchor - (self.place + self.start + moment.carried) @ self.axes.T
         parts = zip(place.unbind(-1), (self.sizes * self.step).unbind(), self.wraps, strict=True)
         place = torch.stack([x.remainder(side) if wraps else x for x, side, wraps in parts], dim=-1)
@@ -249,8 +249,8 @@ class CarriedField(Tabulated):
 class FrozenWind(CarriedField):
     """Adds a frozen field from a file, carried by the mean flow: TurbSim's .bts, hipersim's .nc, or a .npz.
 
-    The x axis of the file points along the flow, y to its left, z up. Along the wind it starts again at its end; across
-    and up its outermost values go on outside.
+    The x axis of the file points along the flow, y to its left, z up. Along the wind it repeats; across and up, the
+    outermost values extend outside.
 
     A .bts contains the mean wind as well. The mean at the hub is subtracted, since ``wind.flow`` has it and must have
     the same speed; the turbulence and the profile of the mean are left. Other files contain deviations from the mean.
@@ -308,7 +308,7 @@ class FrozenWind(CarriedField):
 class RecordedWind(Tabulated):
     """Adds a wind that was recorded on a regular grid, over time; linear in time and along each axis.
 
-    Outside the grid its outermost values go on. With ``wind.flow: [0, 0, 0]`` it is the whole wind.
+    Outside the grid, the outermost values apply. With ``wind.flow: [0, 0, 0]`` it is the whole wind.
 
     Args:
         path: A .npz or .nc file, see :func:`~gaussian_swaying.wind.wind_files.read_grid`; places in m and velocities in
@@ -364,7 +364,7 @@ class RecordedWind(Tabulated):
 
 
 def extinction(density: Tensor, spacing: Tensor) -> Tensor:
-    r"""Share of the wind that is left on its way along the first axis of a grid.
+    r"""Share of the wind left after its way along the first axis of a grid.
 
     Leaves of a drag area per volume a take the momentum :math:`\tfrac12 \rho a u^2` from the air, so that
 
@@ -385,7 +385,7 @@ def extinction(density: Tensor, spacing: Tensor) -> Tensor:
 
 
 def deposited(place: Tensor, amount: Tensor, cells: int) -> Tensor:
-    """Amounts shared among the eight corners around each place, by the weights of trilinear interpolation.
+    """Distribute amounts to the eight corners around each place, with trilinear weights.
 
     They are summed as whole numbers of 2^-40 of the largest, so that the sum does not depend on its order.
 

@@ -259,14 +259,13 @@ def _sheared(
 class Turbulence(CarriedField):
     """Turbulence in space and time: a box without divergence that the mean wind carries along.
 
-    It depends on its seed alone: not on the device, the substep or the number of Gaussians. See
-    :func:`turbulence_box`. A cell of a sixteenth of the length resolves 92 % of
-    the variance of the along-wind component, and interpolation between its corners takes some more of the smallest
-    waves (docs/wind.md).
+    It depends on its seed alone: not on the device, the substep or the number of Gaussians. See :func:`turbulence_box`.
+    A cell of a sixteenth of the length resolves 92 % of the variance of the along-wind component, and interpolation
+    between its corners takes some more of the smallest waves (docs/wind.md).
 
     Args:
         intensity: Standard deviation of the component along the wind per speed of the mean flow.
-        length: Its integral length scale [m]: roughly the size of the largest gusts. Near the ground it is about the
+        length: Integral length scale [m]: roughly the size of the largest gusts. Near the ground it is about the
             height above it.
         spectrum: ``von_karman``, or ``kaimal`` for a boundary layer.
         gamma: Mann's shear, which makes gusts along the wind stronger than those up and down; 3.9 near the ground, and

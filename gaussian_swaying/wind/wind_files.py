@@ -217,7 +217,6 @@ def _plain(units: str) -> str:
 
 
 def _check_units(path: Path, name: str, units: str, known: tuple[str, ...]) -> None:
-    """Refuse units other than those that are known, of which the second is the usual one."""
     if _plain(units.split(" since ")[0]) not in known:
         raise ValueError(f"`{name}` in {path} is in {units!r}, not in {known[1]}: convert it first.")
 

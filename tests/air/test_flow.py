@@ -33,7 +33,6 @@ def _populations(moments):
 
 
 def _collided(moments, relaxation=0.8, smagorinsky=0.0, push=(0.0, 0.0, 0.0)):
-    """The sums of the populations, and the moments after a collision."""
     sums = (torch.zeros(50).double(),) * 10
     for c, f in zip(DIRECTIONS, _populations(moments), strict=True):
         sums = on_tensors(kernels.gather)(sums, f, *c)
@@ -89,7 +88,6 @@ def test_units_of_a_speed():
 
 @pytest.mark.parametrize("cell", [(3, 2, 4), (0, 5, 7)])
 def test_air_that_is_too_dense_goes_to_all_neighbours(cell):
-    """From inside and from a corner of a periodic box: the population of a direction has its weight, and its way."""
     flow = LatticeFlow((7, 6, 8), UNITS, faces=("periodic",) * 3)
     state = flow.start(dtype=torch.float64)
     state.moments[0][cell] = 1e-3
@@ -102,7 +100,6 @@ def test_air_that_is_too_dense_goes_to_all_neighbours(cell):
 
 
 def _random(flow, seed=0):
-    """A flow that differs from cell to cell, with moving walls, and a wind that blows in and out."""
     draw = seeded(seed)
     velocity = randn(3, *flow.cells, generator=draw)
     walls = 0.1 * randn(3, *flow.cells, generator=draw)
@@ -114,7 +111,6 @@ def _random(flow, seed=0):
 
 
 def _ball(place):
-    """A wall that lies where it is, not at the borders of cells."""
     return (place - double([6.3, 5.2, 4.6])).square().sum(-1) < 2.6**2
 
 
@@ -122,7 +118,6 @@ def _ball(place):
     ("name", "walls"), [*((name, walls) for name in BOXES for walls in ("none", "some")), ("wind over ground", "ball")]
 )
 def test_a_step_of_float32_is_that_of_float64(name, walls, kernel_device):
-    """With interpolated bounce-back at a ball."""
     cells, faces = BOXES[name]
     solid = {"some": torch.rand(cells, generator=seeded(1)) < 0.05, "ball": _ball}.get(walls)
     flow = LatticeFlow(cells, UNITS, faces=faces, walls=solid)
@@ -137,7 +132,6 @@ def test_a_step_of_float32_is_that_of_float64(name, walls, kernel_device):
 
 
 def test_nothing_flows_back_in_where_the_wind_blows_out():
-    """At an open face the air behind it goes on, along the face in any case and across it outwards alone."""
     flow = LatticeFlow((6, 5, 4), UNITS)
     state, _ = _random(flow)
     moments = state.moments.clone()

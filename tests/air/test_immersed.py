@@ -1,5 +1,3 @@
-"""Surfaces in the air: momentum to rounding, and no overshoot for any mass."""
-
 import pytest
 import torch
 from shared import double, near, peak, rand, randn, seeded

@@ -1,5 +1,3 @@
-"""Captures in every format, against the cameras and pictures that were written."""
-
 import json
 import math
 from contextlib import nullcontext
@@ -40,8 +38,6 @@ def write_points(path, places, kind="<f4"):
 
 @pytest.fixture
 def written(tmp_path):
-    """A folder with a transforms.json of some cameras and their images."""
-
     def write(count=3, **fields):
         return write_transforms(tmp_path, arc(count), _names(count), **fields)
 
@@ -222,7 +218,6 @@ def test_the_model_with_most_images_is_read(tmp_path, models, read, found):
 
 
 def test_images_without_their_second_lines(tmp_path):
-    """Lines of points that were empty may be missing; a name may consist of numbers."""
     names = ["1", "2 3.5 4.png", "7  8.png", "9"]
     write_colmap(tmp_path, arc(4), [f"{name.removesuffix('.png')}.png" for name in names], binary=False)
     file = tmp_path / "sparse/0/images.txt"
@@ -246,7 +241,6 @@ def test_byte_order_marks(tmp_path, encoding, written):
 
 
 def _turned(index, orientation, size):
-    """A picture that has to be turned as its tag says."""
     image, tags = Image.fromarray(picture(index, *size)), Image.Exif()
     tags[0x112] = orientation
     back = {3: Image.ROTATE_180, 5: Image.TRANSPOSE, 6: Image.ROTATE_90, 8: Image.ROTATE_270}
@@ -308,7 +302,6 @@ FAR_AWAY = double([500123.25, 4649776.5, 312.0])
 
 @pytest.mark.parametrize("kind", ["bin", "txt", "transforms"])
 def test_map_coordinates_keep_their_detail(tmp_path, kind):
-    """Cameras, points and extent are those of the same capture near zero, counted from the origin."""
     captures, views = [], []
     for folder, offset in ((tmp_path / "near", 0 * FAR_AWAY), (tmp_path / "far", FAR_AWAY)):
         poses, names = arc(5), _names(5)

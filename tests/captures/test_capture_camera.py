@@ -1,5 +1,3 @@
-"""Cameras of a capture as camera paths: both kinds of files give the same."""
-
 import json
 import math
 
@@ -27,7 +25,6 @@ def _cameras():
 
 @pytest.fixture(params=["transforms", "colmap"])
 def capture(request, tmp_path):
-    """A capture without its images, whose files have another order than the names."""
     cameras = [_cameras()[name] for name in ("c.png", "a.png", "b.png")]
     names, without = ["images/c.png", "images/a.png", "images/b.png"], {"images": False}
     if request.param == "transforms":
@@ -91,7 +88,6 @@ def test_views_of_different_sizes_need_one(tmp_path):
 
 
 def test_places_that_count_from_an_origin(capture):
-    """Another path, as the camera may be in a second simulation; one without places of a file is the same."""
     origin = (1000.5, -2000.0, 3.0)
     path = CaptureCamera(capture, "b")
     before = path(0, 0.0, CENTER, UP, 1.0).position

@@ -1,5 +1,3 @@
-"""The generated photographs against the surface that they show."""
-
 import math
 
 import pytest

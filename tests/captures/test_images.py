@@ -1,5 +1,3 @@
-"""Files of every kind become bytes of the wanted size, or one sentence."""
-
 import os
 
 import imageio.v3 as iio

@@ -1,5 +1,3 @@
-"""Where training starts: points of the capture, of files, and at random."""
-
 from dataclasses import replace
 
 import numpy as np

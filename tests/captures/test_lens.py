@@ -1,5 +1,3 @@
-"""Distortion against its definition: inverse, picture of a known scene, the largest rectangle."""
-
 from dataclasses import replace
 
 import pytest
@@ -48,7 +46,6 @@ def test_the_undistorted_picture_is_that_of_a_pinhole(distortion):
 
 @pytest.mark.parametrize("distortion", [FOX, BARREL, PINCUSHION])
 def test_the_undistorted_picture_is_the_largest_that_is_covered(distortion):
-    """Its corner pixels lie within the old pixel centres; one more column or row on any side does not."""
     lens = _lens(distortion)
     target = lens.undistorted()
 

@@ -1,5 +1,3 @@
-"""Names of photos in the files of a capture mean the photos that people have on disk."""
-
 import pytest
 from shared import value_error
 

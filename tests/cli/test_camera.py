@@ -21,7 +21,6 @@ CAMERA = look_at_camera([1.0, -1.8, 0.8], [0.6, 0.0, 0.4], [0.0, 0.0, 1.0], 42.0
 
 @pytest.fixture
 def flag(tmp_path):
-    """A splat, and a picture of it."""
     cloud = FlagScene(spacing=0.012, pattern="printed", ripple=0.06).generate()
     write_ply(tmp_path / "flag.ply", cloud)
     picture = (painter_of(cloud)(CAMERA).color.clamp(0, 1) * 255).round().to(torch.uint8)

@@ -1,5 +1,3 @@
-"""One place turns errors into a sentence and an exit code."""
-
 import os
 import re
 import subprocess
@@ -31,7 +29,6 @@ def raising(error):
 
 
 def caught(function):
-    """What a function really raises, as messages differ between versions of the libraries."""
     try:
         function()
     except Exception as error:
@@ -66,7 +63,6 @@ def test_what_input_and_machine_cause_is_a_sentence(error, words, capsys):
 
 
 def test_a_bug_is_called_one(capsys, monkeypatch):
-    """And keeps its traceback where it is asked for."""
     assert run_command(lambda: parser_sentence(None)) == 1
     said = capsys.readouterr().err
     assert said.startswith("error: AttributeError: 'NoneType'")
@@ -113,7 +109,6 @@ def test_a_warning_is_one_line_and_said_once(capsys):
 
 @pytest.mark.skipif(INTERPRETED, reason="nothing is compiled")
 def test_kernels_that_were_compiled_are_told_once_on_standard_error(tmp_path, monkeypatch, capsys):
-    """And not those of an earlier command."""
     assert compiles("cpu")
     monkeypatch.setenv("GAUSSIAN_SWAYING_CACHE", str(tmp_path))
     monkeypatch.setattr(cpu, "_COMPILED", {})
@@ -153,7 +148,6 @@ def test_a_misspelt_option_is_guessed(arguments, guess):
 
 
 def test_the_page_tells_how_to_complete(tmp_path):
-    """The lines of the page, in bash, give the options of the command."""
     page = (ROOT / "docs/command_line.md").read_text(encoding="utf-8")
     line = next(line for line in page.splitlines() if line.startswith("complete "))
     name = "gaussian-swaying"

@@ -23,7 +23,6 @@ def _simulate(folder, gravity):
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
-    """A run, and a reference made of another run whose flag falls faster."""
     folder = tmp_path_factory.mktemp("eval")
     run, reference = folder / "run", folder / "reference"
     _simulate(run, -9.8)

@@ -1,5 +1,3 @@
-"""The command line of the converter."""
-
 import pytest
 import torch
 from shared import refused
@@ -18,7 +16,6 @@ def flag(tmp_path):
 
 
 def _declared(path):
-    """Frames per second, metres per unit and the direction within the scene that the stage shows as up."""
     usd, geom = pytest.importorskip("pxr.Usd"), pytest.importorskip("pxr.UsdGeom")
     stage = usd.Stage.Open(str(path))
     assert geom.GetStageUpAxis(stage) == "Z"

@@ -40,7 +40,6 @@ def test_bad_input(fields, words, tmp_path, monkeypatch, capsys):
 
 
 def test_without_opencv(tmp_path, monkeypatch, capsys):
-    """Before the videos are read."""
     monkeypatch.setitem(sys.modules, "cv2", None)
     refused(main, ["--config", _file(tmp_path / "fit.yaml")], capsys, "pip install 'gaussian-swaying[fit]'")
 

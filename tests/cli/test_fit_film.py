@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 import subprocess
 
 import imageio_ffmpeg
@@ -33,28 +34,24 @@ pytest.importorskip("cv2")
 
 @pytest.fixture(scope="module")
 def case(tmp_path_factory):
-    """A flag on its pole, and a film of it."""
     folder = tmp_path_factory.mktemp("film")
     write_case(folder, size=(270, 480), still=0.3, moving=0.7, spacing=0.025)
     return folder
 
 
 def _check(case, output, *more, film="film.mp4"):
-    """The code of the command that writes the files before a fit of a film in the folder of the case."""
     given = [str(case / film), "--splat", str(case / "my.ply"), "--up", "+z", "--output", str(output)]
     return main([*given, *more, "--device", "cpu", "--check"])
 
 
 @pytest.fixture(scope="module")
 def checked(case):
-    """The files before a fit, with the pole's length."""
     folder = case / "out"
     assert _check(case, folder, "--length", "pole", "2.5", "--focal", "36.2") == 0
     return folder
 
 
 def test_the_file_that_a_fit_reads(checked):
-    """The scale is that of the pole, and the part of the film begins before the motion."""
     plan = read_plan(checked / "fit.yaml")
     assert [u.name for u in plan.unknowns] == ["wind.speed", "wind.azimuth", "material.E", "film.start"]
     for u in plan.unknowns[:3]:
@@ -71,7 +68,6 @@ def test_the_file_that_a_fit_reads(checked):
 
 
 def test_a_film_is_fitted_from_python_as_from_the_command_line(case, checked, tmp_path, monkeypatch, capsys):
-    """The same plan in the same places; what has another type is refused."""
     monkeypatch.setattr(from_film, "run_fit", lambda plan, output, **settings: (plan, output, settings))
     given = {"up": "+z", "focal": 36.2, "device": "cpu", "progress": False}
     film, splat, output = case / "film.mp4", case / "my.ply", tmp_path / "out"
@@ -86,7 +82,6 @@ def test_a_film_is_fitted_from_python_as_from_the_command_line(case, checked, tm
 
 
 def test_the_pictures_before_the_fit(checked):
-    """The frame and the splat show the same; the pole's edge is held; the free edge is followed."""
     rest = np.asarray(Image.open(checked / "result/before/rest_0.png")).astype(float)[22:]
     frame, _, splat, roles = np.split(rest, 4, axis=1)
     cloth = (np.abs(roles - 255 * np.array(MOVING)) < 30).all(-1)
@@ -102,7 +97,6 @@ def test_the_pictures_before_the_fit(checked):
 
 
 def test_a_film_that_does_not_say_its_length(case, checked, tmp_path):
-    """As those that browsers record: all of it is used."""
     with (case / "film.mkv").open("wb") as file:  # ffmpeg cannot go back to write the length
         words = ["-v", "error", "-i", str(case / "film.mp4"), "-c", "copy", "-f", "matroska", "-"]
         subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), *words], check=True, stdout=file)
@@ -113,7 +107,6 @@ def test_a_film_that_does_not_say_its_length(case, checked, tmp_path):
 
 @pytest.fixture(scope="module")
 def seen(case):
-    """The first frame with its true camera, and the preview of the splat."""
     film, cloud, camera = open_film(case / "film.mp4"), read_gaussians(case / "my.ply", 0), camera_of(270, 480)
     return Seen(film, film.first_frame(), cloud, camera, painter_of(cloud)(camera), 0.0), guess(cloud)
 
@@ -137,7 +130,6 @@ def test_lengths_of_nothing(seen, name, told):
 
 
 def test_the_extent_does_not_depend_on_the_turn():
-    """A square cloth is as long as its side, however it is turned about the vertical, and not as its diagonal."""
     share = torch.rand(4000, 2, generator=seeded(0))
     for angle in (0.0, 0.5, 0.785):
         points = torch.stack([share[:, 0] * math.cos(angle), share[:, 0] * math.sin(angle), share[:, 1]], 1)
@@ -145,7 +137,6 @@ def test_the_extent_does_not_depend_on_the_turn():
 
 
 def test_a_fit_without_a_length_keeps_the_edited_file(case, checked, capsys):
-    """A very small fit to its end: the page, and the sentences on what the values rest on."""
     edited = (checked / "fit.yaml").read_text() + "tracks: 30\n"
     (checked / "fit.yaml").write_text(edited)
     assert _check(case, checked) == 0
@@ -161,13 +152,13 @@ def test_a_fit_without_a_length_keeps_the_edited_file(case, checked, capsys):
     assert "weigh it" in told
     assert "sees the wind blow to the" in told
     page = (case / "result/page.html").read_text()
-    assert page.count("data:video/mp4;base64,") == 1
-    assert page.count("data:image/jpeg;base64,") == 2
+    files = re.findall('src="([^"]+)"', page)
+    assert len(files) == 3
+    assert all((case / "result" / file).stat().st_size > 0 for file in files)
     assert "wind.azimuth" in page
 
 
 def test_the_weight_as_a_ruler(case, checked, capsys, monkeypatch):
-    """The length of a scene unit is sought; what was captured in balance with its weight, as a plant, is refused."""
     found = guess(read_gaussians(case / "my.ply", 0))
     assert found.falls  # a flag is not in balance
     weightless = dataclasses.replace(found, kind="shrub")
@@ -224,7 +215,6 @@ def test_films_that_do_not_work(case, shown, told, capsys):
 
 
 def test_a_film_is_not_upside_down():
-    """A guess that is up in the film, too, stays; else the nearest axis of the splat is taken, or numbers."""
     level = look_at_camera((0.0, -3.0, 1.0), (0.0, 0.0, 0.5), (0, 0, 1), 40.0, 20, 10)
     assert upright_in(level, [0.2, 0.0, 0.9]) is None
     assert upright_in(level, [0.0, -1.0, 0.0]) == [0.0, 0.0, 1.0]

@@ -76,7 +76,6 @@ def test_a_splat_gets_what_the_preview_suggests(parser, tmp_path):
 
 
 def test_a_plant_in_a_pot_moves_in_it(parser, tmp_path):
-    """Its parts are in a file that the settings name."""
     path = tmp_path / "plant.ply"
     write_ply(path, alocasia(spacing=0.005))
     settings = settings_of_splat(parser, path, torch.device("cpu"), tmp_path, quick=True)
@@ -165,7 +164,6 @@ def test_ctrl_c_ends_it_cleanly(tmp_path):
 
 
 def test_a_splat_has_the_wind_of_its_preview(tmp_path):
-    """Of a cloth, too, whose stretch of the turbulence is looked for without modes."""
     splat = tmp_path / "flag.ply"
     export_cloud(splat, FlagScene(spacing=0.05, stand="pole").generate())
     parser = Simulation.parser()

@@ -11,7 +11,6 @@ SMALL = ["--scene.generator.init_args.spacing=0.05", "--solver.dx", "0.2", "--ma
 
 
 def test_a_page_from_the_name_of_a_configuration(tmp_path, capsys, monkeypatch):
-    """Beside where the command runs, with options of sim; for a phone the grid becomes coarser."""
     monkeypatch.chdir(tmp_path)
     assert main(["--live-web", "flag", *SMALL]) == 0
     told = (

@@ -1,5 +1,3 @@
-"""The installed program, and configurations by name."""
-
 import os
 import runpy
 import subprocess
@@ -72,7 +70,6 @@ def test_each_command_has_its_own_help(name, capsys):
 
 @pytest.mark.parametrize("name", ["sim", "preview", "eval", "export", "train", "convert_physgaussian"])
 def test_each_tool_is_a_program(name, monkeypatch, capsys):
-    """In this process; test_simulate.py starts one in its own."""
     monkeypatch.setattr(sys, "argv", [f"tools/{name}.py", "--help"])
     with pytest.raises(SystemExit) as left:
         runpy.run_path(str(ROOT / "tools" / f"{name}.py"), run_name="__main__")

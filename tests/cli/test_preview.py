@@ -27,12 +27,10 @@ FLAG = ROOT / "configs/sim/flag.yaml"
 
 @pytest.fixture(autouse=True)
 def _few_frames(monkeypatch):
-    """Of those that are timed, which is tested in test_cost.py."""
     monkeypatch.setattr("gaussian_swaying.suggestion.cost.MOST_FRAMES", 2)
 
 
 def test_where_map_coordinates_begin(tmp_path, capsys):
-    """In the short preview and where the starter runs, which place nothing in the coordinates of the file."""
     flag, out = FlagScene(spacing=0.08).generate(), str(tmp_path / "out")
     write_ply(tmp_path / "a.ply", dataclasses.replace(flag, origin=(500123.0, 4649776.0, 312.0)))
     given = ["--device", "cpu", "--frames", "2"]
@@ -82,7 +80,6 @@ def test_the_report_and_its_files(splat, tmp_path, capsys):
 
 
 def test_ten_lines_and_a_command_for_a_shell(splat, tmp_path, capsys):
-    """Warnings come on top, of no pin that the preview chose; names with blanks and # are quoted."""
     folder = tmp_path / "my scan #1"
     folder.mkdir()
     splat.rename(folder / "flag.ply")
@@ -123,7 +120,6 @@ def test_specks_are_noted_and_follow(splat, tmp_path, capsys):
 
 
 def test_a_material_may_be_given(splat, tmp_path, capsys):
-    """And none of its numbers is that of a kind."""
     assert preview(splat, tmp_path / "out", "--material", "rubber", "--frames", "2") == 0
     assert "rubber, E = 2e+06 Pa, 925 kg/m^3, 0.002 m thick; as it was given" in capsys.readouterr().out
     check_refused(splat, tmp_path, capsys, "--material", "ruber", words="'ruber'")

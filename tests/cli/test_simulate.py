@@ -1,5 +1,3 @@
-"""The command line: what it accepts, and the one sentence it answers bad input with."""
-
 import json
 import os
 import re
@@ -22,7 +20,6 @@ RUN = [f"--config={FLAG}", "--frames=2", "--device=cpu", *words(SMALL)]
 
 
 def _code(arguments):
-    """The exit code, returned or raised."""
     try:
         return main(arguments)
     except SystemExit as stop:
@@ -37,7 +34,6 @@ def check_refused(arguments, output, capsys, *told):
 
 
 def test_a_material_that_flows(tmp_path, capsys):
-    """A law with its own arguments on the command line; `total` refuses it in one sentence."""
     law = ["--material.law", "Sand", "--material.law.init_args.friction_angle", "35"]
     check_refused([*RUN, *law], tmp_path / "out", capsys, "Sand", "solver.formulation", "updated")
     assert _code([*RUN, *law, "--solver.formulation", "updated", "--output", str(tmp_path / "out")]) == 0
@@ -46,7 +42,6 @@ def test_a_material_that_flows(tmp_path, capsys):
 
 
 def test_torn_particles_are_warned_of(tmp_path, capsys):
-    """`updated` on a grid finer than the flag's particles."""
     arguments = [*RUN, "--frames", "6", "--solver.formulation", "updated", "--solver.dx", "0.08"]
     assert _code([*arguments, "--output", str(tmp_path / "out")]) == 0
     assert "particles are farther than two cells from a neighbour" in capsys.readouterr().err
@@ -57,7 +52,6 @@ def test_torn_particles_are_warned_of(tmp_path, capsys):
 
 
 def test_the_tool_as_a_program(tmp_path):
-    """Exit code and streams of the process itself, from another folder."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, str(ROOT / "tools/sim.py"), *RUN, "--material.nu", "0.5"]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
@@ -85,7 +79,6 @@ def test_cameras_and_renders_from_a_configuration(tmp_path, capsys):
 
 
 def test_the_blocks_of_the_page_on_recording_are_configurations(tmp_path):
-    """Each parses after the flag's, and makes its cameras, recorder and edits."""
     blocks = (ROOT / "docs/recording.md").read_text(encoding="utf-8").split("```yaml\n")[1:]
     assert len(blocks) == 4
     parser = Simulation.parser()
@@ -108,7 +101,6 @@ def test_print_config_parses_back(tmp_path, capsys):
 
 
 def _help(capsys, option):
-    """What an option of help prints, and the options that it lists."""
     capsys.readouterr()
     assert _code([option]) == 0
     text = capsys.readouterr().out
@@ -116,7 +108,6 @@ def _help(capsys, option):
 
 
 def test_help_shows_the_options_that_people_use(capsys):
-    """Twenty of them, in the words of the help on all; the parser is as before, for a page that goes on."""
     parser = Simulation.parser()
     before = parser.format_help()
     with pytest.raises(SystemExit):

@@ -29,7 +29,6 @@ QUICK = ROOT / "configs/train/quick_cpu.yaml"
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
-    """A generated flag as a folder of images."""
     return GeneratedCapture(views=10, size=40).write(tmp_path_factory.mktemp("data") / "flag", threads=1)
 
 
@@ -51,7 +50,6 @@ def _arguments(capture, folder, **options):
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda path: path.name)
 def test_every_shipped_configuration_builds(config, tmp_path, monkeypatch):
-    """Parsed, and model, data and trainer made; an overlay goes on top of the default."""
     monkeypatch.chdir(tmp_path)
     text = yaml.safe_load(config.read_text())
     files = [config] if "class_path" in text.get("data", {}) else [CONFIGS_DEFAULT, config]
@@ -68,7 +66,6 @@ CONFIGS_DEFAULT = ROOT / "configs/train/default.yaml"
 
 
 def test_the_recipe_for_photos_runs_on_a_capture(capture, tmp_path, capsys):
-    """A few images: points at which the photos agree, and a splat at the end."""
     given = {"data.init_args.path": str(capture), "data.init_args.downscale": 2, "data.init_args.point_count": 200}
     given |= {"trainer.max_steps": 4, "trainer.val_check_interval": 4, "trainer.enable_progress_bar": False}
     assert main(["fit", "--config=photos_cpu", *words(given | {"trainer.default_root_dir": str(tmp_path)})]) == 0
@@ -126,7 +123,6 @@ def _stop_at(monkeypatch, step, error):
     ids=["Ctrl-C", "SIGTERM", "failure", "divergence"],
 )
 def test_a_training_that_ends_early_names_its_checkpoint(error, code, told, capture, tmp_path, monkeypatch, capsys):
-    """And the command that continues it, which does; the log goes on, and the folder is free again."""
     monkeypatch.setattr(sys, "argv", ["tools/train.py"])
     monkeypatch.chdir(tmp_path)
     folder, steps = Path("run"), {"trainer.max_steps": 16, "model.log_every": 4}
@@ -224,7 +220,6 @@ class Flatness(LossTerm):
 
 
 def test_a_loss_of_ones_own_from_a_yaml(capture, tmp_path, monkeypatch):
-    """Added to the four by its class path; a weight on the command line leaves the others."""
     (tmp_path / "my_losses.py").write_text(OWN)
     monkeypatch.syspath_prepend(str(tmp_path))
     term = {"flat": {"class_path": "my_losses.Flatness", "init_args": {"share": 0.25}}}

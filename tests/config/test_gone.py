@@ -1,5 +1,3 @@
-"""Names that configurations no longer have are refused with what took their place."""
-
 import pytest
 from shared import value_error
 

@@ -1,5 +1,3 @@
-"""`material: cotton` in a YAML, on the command line and in Python."""
-
 import pytest
 from shared import refused, up_to, value_error
 
@@ -17,8 +15,6 @@ SCENE = "scene: {generator: {class_path: FlagScene, init_args: {spacing: 0.1}}}\
 
 @pytest.fixture
 def read(tmp_path):
-    """The settings of several files, and of options after them."""
-
     def parse(*texts, options=()):
         arguments = []
         for k, text in enumerate(texts):

@@ -23,7 +23,6 @@ PHYSGAUSSIAN = {
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    """A folder to work in, with the splat of a flag and a run of four frames."""
     folder = tmp_path_factory.mktemp("place")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -49,7 +48,6 @@ def test_sim(place, capsys):
 
 
 def test_eval(place):
-    """A run beside itself has no error."""
     works("eval run run --device=cpu --no-video")
     found = json.loads((place / "run/eval/eval.json").read_text())
     assert [row["mse"] for row in found["per_frame"]] == [0.0] * 4
@@ -57,7 +55,6 @@ def test_eval(place):
 
 @pytest.mark.parametrize("suffix", [format.endings[0] for format in FORMATS.values()])
 def test_export(place, suffix):
-    """Places within a thousandth of the flag, and turned with z up where a format says which axis that is."""
     if suffix == ".usdc":
         pytest.importorskip("pxr")
     works(f"export flag.ply flag{suffix} --up 0 0 1" if suffix in (".glb", ".usdc") else f"export flag.ply b{suffix}")
@@ -73,7 +70,6 @@ def test_export(place, suffix):
 
 
 def test_export_of_a_run(place):
-    """Its frames as splats, in a folder that is made."""
     works("export run frames/flag_###.spz")
     assert sorted(path.name for path in (place / "frames").iterdir()) == [f"flag_{k:03d}.spz" for k in range(4)]
     moved = [read_gaussians(place / f"frames/flag_{k:03d}.spz").means for k in (0, 3)]
@@ -81,7 +77,6 @@ def test_export_of_a_run(place):
 
 
 def test_preview(place, capsys):
-    """Its starter is simulated as it is."""
     works("preview flag.ply --hold=-x --frames=3 --height=96 --device=cpu --output=look")
     assert "--config look/starter.yaml" in capsys.readouterr().out
     assert (place / "look/preview.png").stat().st_size > 1000
@@ -144,5 +139,4 @@ INSIDE = {"class_path": "LookAtCamera", "init_args": {"eye": [0.6, 0.0, 0.4], "t
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )
 def test_the_commonest_mistakes_are_one_sentence(place, capsys, changes, words_told):
-    """It names the field and the remedy, and nothing is written."""
     refused(main, ["sim", "--config=flag", *words(SMALL | changes), "--output=no"], capsys, *words_told, folder=place)

@@ -137,7 +137,6 @@ def test_the_error_names_the_call_that_works(assign, remedy):
 
 @pytest.mark.parametrize("from_file", [True, False])
 def test_the_record_says_what_runs(tmp_path, from_file):
-    """What was assigned, and tensors that were changed in place, as an optimizer does."""
     simulation = _simulation()
     if from_file:
         simulation.config = "frames: 250\n"
@@ -182,7 +181,6 @@ def test_a_class_of_ones_own_keeps_its_own_names():
 
 
 def _turns(make, count=6):
-    """The last states of two simulations, each alone and both in turns."""
     alone = [list(make(which).frames(count))[-1].state.position for which in (0, 1)]
     both = [make(which).frames(count) for which in (0, 1)]
     for _ in range(count):
@@ -211,7 +209,6 @@ def _with_effect(shared):
     ],
 )
 def test_simulations_share_no_part(make, shared):
-    """One part given to two simulations: each moves as it does alone."""
     alone, together = _turns(make(shared))
     fresh, _ = _turns(lambda which: make(copy.deepcopy(shared))(which))
     for first, other, third in zip(alone, together, fresh, strict=True):

@@ -1,5 +1,3 @@
-"""Simulation as users meet it in Python and in a YAML: short forms, frames, winds, gradients, several together."""
-
 import pytest
 import torch
 from shared import beyond, in_both, near, peak, up_to, user_warning, value_error
@@ -57,7 +55,6 @@ def test_frames_are_those_of_a_run(tmp_path):
 
 
 def test_another_wind_holds_from_the_next_frame_on():
-    """The same as a run in that wind from the state in which it was assigned."""
     simulation, ends = _flag(), []
     for frame in simulation.frames(4):
         if frame.index == 1:
@@ -74,7 +71,6 @@ def test_another_wind_holds_from_the_next_frame_on():
 
 
 def test_numbers_change_by_their_names_between_frames():
-    """As a run with these numbers from the state at which they changed."""
     simulation, other = _flag(), _flag(material=Material(E=3e4, density=30.0), wind=[0.0, 5.0, 0.0])
     for frame in simulation.frames(4):
         if frame.index == 1:

@@ -1,5 +1,3 @@
-"""Gradients of a simulation: those of its constructor's tensors are right, and none is lost without a word."""
-
 import pytest
 import torch
 from shared import double, near, up_to, value_error
@@ -17,7 +15,6 @@ DOUBLE = torch.float64
 
 
 def _simulation(values, edits=(), transfer="auto"):
-    """A flag in a wind that meets it obliquely, with a fixed number of substeps."""
     given = VALUES | values
     pin = PinnedRegion(up_to(x=0.11))
     return Simulation(
@@ -40,7 +37,6 @@ def _end(simulation):
 
 
 def _moved(values):
-    """A sum over the flag that no symmetry makes insensitive to any of the values."""
     simulation = _simulation(values)
     moved = _end(simulation).position - simulation.scene.points.position
     return (moved * double([3.0, 1.0, 2.0])).sum(-1).mean()

@@ -45,7 +45,6 @@ def _yaml(heading):
 
 @pytest.fixture(scope="module")
 def extensions(tmp_path_factory):
-    """The page's file, imported; what it adds to tables is taken out again."""
     folder, before = tmp_path_factory.mktemp("own"), [dict(table) for table in TABLES]
     (folder / "extensions.py").write_text("".join(_blocks("python")))
     with pytest.MonkeyPatch.context() as patch:
@@ -62,8 +61,6 @@ def extensions(tmp_path_factory):
 
 @pytest.fixture
 def run(extensions, tmp_path):
-    """Runs a flag of twelve by eight Gaussians with changes: its settings as saved, and the positions."""
-
     def run(name, changes, frames=4):
         assert main([*given(changes), f"--frames={frames}", f"--output={tmp_path / name}"]) == 0
         stored = yaml.safe_load((tmp_path / name / "config.yaml").read_text())
@@ -94,7 +91,6 @@ def test_ten_changes_are_short_and_take_one_file():
 
 
 def test_a_force(run):
-    """Towards a place three metres from the flag, along y; its strength has a slider, which works."""
     still, name = {"wind.flow": [0, 0, 0]}, "forces.Pull.strength"
     pull = _yaml("A force with a live slider")
     free = run("free", still)[1]
@@ -114,7 +110,6 @@ def test_a_force(run):
 
 
 def test_an_unknown_of_a_fit(extensions, tmp_path):
-    """It is found in the plan of the page, in the simulation, and two values of it are one batch that moves apart."""
     (tmp_path / "fit.yaml").write_text(_blocks("yaml", SECTIONS["An unknown of a fit"])[0])
     (unknown,) = read_plan(tmp_path / "fit.yaml").unknowns
     assert (unknown.name, unknown.low, unknown.high) == ("wind.modulations.0.growth", 0.1, 8.0)
@@ -189,7 +184,6 @@ def test_a_shape_of_pin(run):
 
 
 def test_a_pass(run, tmp_path):
-    """Violet where nothing has moved yet; green and yellow later."""
     run("run", {"recorder.renders": ["color", "moved"], "recorder.video": False})
     first, last = (iio.imread(tmp_path / f"run/moved/0000{frame}.png").astype(int) for frame in (0, 3))
     assert np.unique(first.reshape(-1, 3), axis=0).tolist() == [[0, 0, 0], [68, 1, 84]]
@@ -208,7 +202,6 @@ def test_a_unit(extensions):
 
 
 def test_an_effect_of_the_wind(run):
-    """In the first frame, what is well below the canopy hardly moves, and what is above it moves as without one."""
     wind = {"wind.flow": [0, 8, 0]}
     free = run("free", wind)[1]
     stored, moved = run("below", wind | {"wind.effects": [own("Canopy", canopy=0.01)]})

@@ -13,7 +13,6 @@ GRAPHICS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enab
 
 @pytest.fixture
 def show(chromium):
-    """Opens a page and waits until an expression is true there; what it tells and asks for is kept."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as driver:
@@ -36,13 +35,11 @@ def picture(page):
 
 
 def drawn(page):
-    """The picture as soon as it shows more than the sky."""
     until(lambda: np.abs(picture(page) - picture(page)[0, 0]).max() > 20)
     return picture(page)
 
 
 def check_motion(page, before):
-    """The picture changes, nothing went wrong, and nothing was asked of a network."""
     until(lambda: np.abs(picture(page) - before).max() > 20)
     assert page.told == []
     assert asked_of_a_network(page) == []
@@ -62,7 +59,6 @@ def test_a_film(show, tmp_path, monkeypatch):
 
 
 def test_a_simulation(show, tmp_path, monkeypatch):
-    """The visitor's browser simulates one second."""
     monkeypatch.chdir(tmp_path)
     assert main(["export", "--live-web", "flag", *SMALL, "--material.E=9e3"]) == 0
     page = show(tmp_path / "flag.html", "!!window.windPage")

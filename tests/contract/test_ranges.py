@@ -63,7 +63,6 @@ def test_numbers_beyond_sense_are_refused(make, name, values):
 
 
 def test_what_people_use_is_not_refused():
-    """Snow to steel, a film to a wall, millimetres to a hill, a breeze to a tornado, a clip to a day."""
     for E, density, thickness in ((1e2, 1.0, 1e-6), (2.1e11, 2e4, 5.0), (1.4e5, 400.0, 0.5)):
         assert Material(E=E, density=density, thickness=thickness, damping_ratio=0.0).E == E
     for speed in (0.0, 0.1, 140.0):

@@ -1,5 +1,3 @@
-"""Examples of README and pages print what they show; commands are the promised ones."""
-
 import json
 import re
 from pathlib import Path
@@ -57,7 +55,6 @@ def test_first_two_commands():
 
 
 def _quick_start(folder, capsys, name, *more):
-    """The first run of the README, as it is or with a row of its table, and what it said besides its progress."""
     command = re.search(r"python tools/(sim\.py --config \S+)", README)[1].split()[1:]
     options = re.search(rf"^\| {name} \| `([^`]*)`", README, flags=re.MULTILINE)[1].split() if name else []
     assert main([*command, *options, "--device", "cpu", "--output", str(folder), *more]) == 0

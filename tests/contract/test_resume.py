@@ -58,7 +58,6 @@ def simulation(name):
 
 @pytest.mark.parametrize("name", CASES)
 def test_a_run_in_two_parts_is_the_whole_one(name, tmp_path):
-    """Numbers of all frames, the last picture, the motion, and the checkpoint at the end."""
     recorder = Recorder(video=False, trajectory=name != "copies", nodes=name != "copies")
     whole = simulation(name).run(tmp_path / "whole", 6, progress=False, recorder=recorder)
     simulation(name).run(tmp_path / "parts", 3, progress=False, recorder=recorder)

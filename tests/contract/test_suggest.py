@@ -27,7 +27,6 @@ OPTIONS = [
 
 @pytest.fixture(scope="module")
 def flag(tmp_path_factory):
-    """A suggestion for the file of a flag on its pole."""
     file = tmp_path_factory.mktemp("flag") / "flag.ply"
     gs.write_ply(file, flag_on_a_pole(spacing=0.04))
     return gs.suggest(file, quality="draft", wind=6.0, device="cpu")

@@ -12,7 +12,6 @@ ORIGIN = (1.0, 2.0, 3.0)
 
 
 def picture(frame):
-    """Pixels of one frame: noise that stays and a bright square that moves."""
     pixels = np.random.default_rng(0).integers(0, 40, (HEIGHT, WIDTH, 3), dtype=np.uint8)
     pixels[4:9, 2 + frame : 7 + frame] = 220
     return pixels
@@ -57,8 +56,6 @@ def make_run(tmp_path):
 
 @pytest.fixture
 def make_reference(tmp_path):
-    """A reference of some frames, the first of them at rest; ``before`` frames come earlier."""
-
     def _make(name="reference", frames=4, before=0, start=1, cloth=True, pictures=True, **arrays):
         folder = tmp_path / name
         folder.mkdir()

@@ -1,5 +1,3 @@
-"""Comparing folders whose differences are known."""
-
 import json
 import math
 
@@ -19,8 +17,6 @@ POINTS = 2000
 
 @pytest.fixture
 def compared(make_run, make_reference):
-    """The comparison of a new run with a new reference, each with changes."""
-
     def compare(run=None, reference=None, **options):
         return compare_run(make_run(**(run or {})), make_reference(**(reference or {})), **{"points": POINTS} | options)
 
@@ -63,7 +59,6 @@ def test_a_run_with_known_errors(compared):
 
 
 def test_points_without_a_gaussian_are_not_compared(make_run, make_reference):
-    """Those at the faces of a sheet come after the Gaussians; here they are far away."""
     run, reference = make_run(), make_reference()
     before = compare_run(run, reference)["mean"]["chamfer_m"]
     arrays = dict(np.load(run / "trajectory.npz"))
@@ -94,7 +89,6 @@ def test_scene_units_that_are_not_metres(compared):
 
 
 def test_a_turned_frame(make_run, make_reference):
-    """Turned axes: the particles are where the rotation puts them back."""
     turn = [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     run = make_run(sim_frame={"origin": [1.0, 2.0, 3.0], "rotation": turn, "metres_per_unit": 1.0})
     with np.load(run / "trajectory.npz") as arrays:
@@ -112,7 +106,6 @@ def test_the_frame_that_a_run_writes_is_understood(compared):
 
 
 def test_offsets(make_run, make_reference):
-    """Two frames come before rest in the reference, or rest is missing there."""
     reference = make_reference(before=2)
     found = compare_run(make_run(), reference, reference_offset=2, points=POINTS)
     assert found["mean"]["mse"] == 0.0
@@ -174,7 +167,6 @@ def test_files(make_run, make_reference, tmp_path):
 
 
 def test_the_same_twice(make_run, make_reference, tmp_path):
-    """And what an earlier comparison left does not stay beside the new numbers."""
     run, reference = make_run(), make_reference()
     first = evaluate(run, reference, tmp_path / "out", points=100)
     assert evaluate(run, reference, tmp_path / "out", points=100, video=False) == first

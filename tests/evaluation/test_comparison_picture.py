@@ -1,5 +1,3 @@
-"""The picture of a comparison, pixel by pixel."""
-
 import numpy as np
 import torch
 

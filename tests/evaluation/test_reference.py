@@ -1,5 +1,3 @@
-"""Reading the surface of a reference, and points on it."""
-
 import json
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Motions with a known answer, and the pictures of motion pixel by pixel."""
-
 import json
 import math
 import subprocess

@@ -1,5 +1,3 @@
-"""Areas of patches: each alone by its formula, together against the true area of the surface."""
-
 import math
 
 import pytest
@@ -25,13 +23,11 @@ def _plane(kind, side):
 
 
 def _discs(count, area, overlap):
-    """Flat splats of standard deviation overlap x spacing."""
     scale = math.log(overlap * math.sqrt(area / count))
     return double([scale, scale, scale - 3]).expand(count, 3)
 
 
 def _areas(points, normals=UP, overlap=0.5, opacity=None, area=1):
-    """Of flat splats that share an area."""
     count = len(points)
     return coverage_area(points, normals.expand(count, 3), _discs(count, area, overlap), opacity)
 
@@ -45,7 +41,6 @@ def test_sum_is_the_area_of_a_plane_with_borders(kind, side, overlap):
 
 
 def test_each_patch_of_a_regular_plane_has_its_cell():
-    """Not only the sum: borders and corners included, within the angular resolution of the rays."""
     areas = _areas(_plane("regular", 20), overlap=0.3) * 400
     inner = areas.unflatten(0, (20, 20))[3:-3, 3:-3]
     assert_close(inner, torch.ones_like(inner), rtol=0, atol=0.03)
@@ -92,7 +87,6 @@ def test_shell_counts_each_sheet_from_one_spacing_apart(kind, sign):
 
 
 def test_clones_thickness_and_sizes_do_not_change_the_sum():
-    """What captures have: copies, centres off the surface, sizes and opacities that vary, noisy normals."""
     points, count = _plane("random", 60), 3600
     normals, discs, spacing = UP.expand(count, 3), _discs(count, 1, 0.5), 1 / 60
     copies = coverage_area(points.repeat(3, 1), normals.repeat(3, 1), discs.repeat(3, 1))
@@ -118,7 +112,6 @@ def test_faint_patch_among_opaque_ones_carries_little():
 
 
 def test_twins_share_by_weight():
-    """Two Gaussians at one centre: what one carries alone, they carry together."""
     points = _plane("regular", 20)
     points = torch.cat([points, points[210:211]])
     opacity = torch.ones(401).double()
@@ -139,7 +132,6 @@ def test_few_or_lonely_gaussians_keep_their_own_area(count, device, dtype):
 
 
 def test_wild_input_stays_finite_and_positive():
-    """Floaters, needles, clusters tighter than the neighbour count, lines and coincident points."""
     cluster = 1e-7 * torch.randn(500, 3)
     line = torch.stack([torch.linspace(0, 1, 300), torch.zeros(300), torch.zeros(300)], dim=-1)
     means = torch.cat([torch.rand(2000, 3), cluster, line, torch.full((60, 3), 0.5), torch.tensor([[1e6, 0, 0]])])

@@ -1,5 +1,3 @@
-"""Splats in the formats of web viewers, read again."""
-
 import numpy as np
 import pytest
 import torch
@@ -16,7 +14,6 @@ from gaussian_swaying.gaussians.harmonics import SH_DC
 
 @pytest.mark.parametrize("degree", [0, 1])
 def test_compressed_ply(degree, tmp_path):
-    """Harmonics have an element of their own; what is faint is gone."""
     cloud = varied_cloud(degree=degree)
     cloud.opacities[7] = -8.0
     export_cloud(tmp_path / "a.compressed.ply", cloud)
@@ -27,7 +24,6 @@ def test_compressed_ply(degree, tmp_path):
 
 
 def test_flat_ones_of_other_programs(tmp_path):
-    """A range of sizes that begins at the logarithm of zero."""
     path = tmp_path / "flat.ply"
     _compressed(path, lambda elements: elements["chunk"]["min_scale_z"].put(0, -np.inf))
     with user_warning(r"of 300 Gaussians have a size of zero, and become flat"):

@@ -1,5 +1,3 @@
-"""What is attached to what in a splat."""
-
 import math
 
 import pytest
@@ -18,14 +16,12 @@ def random(seed):
 
 
 def sheet(seed, size=2.0, noise=0.15):
-    """Points on a square in the x-y plane, moved by some spacings at random."""
     axis = torch.arange(0, size, STEP, dtype=torch.float64)
     flat = torch.cartesian_prod(axis, axis, torch.zeros(1).double())
     return flat + noise * STEP * randn(flat.shape, generator=random(seed))
 
 
 def attached_pairs(points, *parts, normals=None):
-    """The pairs, with noisy normals: by default those of horizontal sheets."""
     own = double([0.0, 0.0, 1.0]).expand(len(points), 3) if normals is None else normals
     own = own + 0.3 * randn(own.shape, generator=random(9))
     return connectivity.attached_pairs(points, own, *parts)
@@ -36,7 +32,6 @@ def number_of_pieces(points, pairs, least=1):
 
 
 def across(number, pairs):
-    """Pairs between different numbers."""
     return pairs[number[pairs[:, 0]] != number[pairs[:, 1]]]
 
 
@@ -51,13 +46,11 @@ def test_a_sheet_with_holes_is_one_piece(seed):
 
 @pytest.mark.parametrize(("gap", "pieces"), [(0.4, 1), (4.0, 2)])
 def test_two_layers_are_one_skin_and_two_sheets_are_two(gap, pieces):
-    """The noisy layers of one skin lie closer to each other than their points; leaves do not."""
     points = torch.cat([sheet(0), sheet(1) + torch.tensor([0.03, 0.02, gap * STEP])])
     assert number_of_pieces(points, attached_pairs(points)) == pieces
 
 
 def book(angle):
-    """Two leaves that stand on a stem each a side of it, and touch or cross each other farther out."""
     leaf = sheet(0, noise=0.05)
     turned = [leaf @ rotation(side * angle).T for side in (-1, 1)]
     # the stem joins them below their edges
@@ -101,7 +94,6 @@ def test_what_stays_attached_lies_near_the_planes_of_both():
 
 
 def test_pieces_are_joined_again_where_most_pairs_were_cut():
-    """Three pieces of five points: the contacts with five and four pairs are put back, that with one is not."""
     k = torch.arange(5)
     chains = torch.cat([torch.stack([5 * piece + k[:-1], 5 * piece + k[1:]], 1) for piece in range(3)])
     most = torch.cat([torch.stack([k, k + 5], 1), torch.stack([k[:4] + 5, k[:4] + 10], 1)])
@@ -110,7 +102,6 @@ def test_pieces_are_joined_again_where_most_pairs_were_cut():
 
 
 def test_what_hangs_together_is_never_taken_off():
-    """A sheet that stands on another one, and is attached to nothing else."""
     upright = sheet(1) @ rotation(math.pi / 2).T
     points = torch.cat([sheet(0), upright + double([1.0, 0.0, 2.1])])
     normals = EYE[[2, 0]].repeat_interleave(len(upright), 0)
@@ -133,7 +124,6 @@ def test_a_twig_with_branches_is_one_piece():
 
 
 def test_parts_say_what_they_are_attached_to():
-    """A leaf on another one: attached as they touch, or by their labels to a stem that touches neither."""
     low, high = sheet(0), sheet(1) + torch.tensor([0.0, 0.0, 0.3 * STEP])
     stem = sheet(2, size=0.3) + torch.tensor([-1.0, 0.0, 0.0])
     points = torch.cat([low, high, stem])

@@ -37,7 +37,6 @@ def _header(rng):
 
 
 def _numbers(rng):
-    """Floats that are others, as they are in a .ply file."""
     head, mark, body = _read("scene.ply").partition(b"end_header\n")
     data = bytearray(body)
     for _ in range(rng.choice((1, 4))):
@@ -78,7 +77,6 @@ DAMAGES = {
 
 
 def _try(path, case):
-    """Whether it was refused or warned of."""
     told = None
     tracemalloc.start()
     try:

@@ -1,5 +1,3 @@
-"""Files for viewers: what is left out of them, films, and names; test_compact.py reads what gsplat wrote."""
-
 import math
 from dataclasses import replace
 
@@ -24,7 +22,6 @@ from gaussian_swaying.geometry.rotations import quat_to_rotation
 
 
 def test_one_bad_value_does_not_empty_the_file(tmp_path):
-    """gsplat writes nothing at all for one NaN or infinite opacity."""
     cloud = varied_cloud()
     cloud.opacities[3], cloud.opacities[4], cloud.opacities[5] = math.nan, math.inf, -math.inf
     cloud.means[6, 1], cloud.sh[7, 1, 0], cloud.quats[8] = math.inf, math.nan, 0.0
@@ -44,7 +41,6 @@ def test_one_bad_value_does_not_empty_the_file(tmp_path):
 
 
 def test_equal_values_in_a_chunk_are_kept(tmp_path):
-    """gsplat divides by the range of a chunk, which is zero for a flat white sheet."""
     cloud = varied_cloud(degree=0)
     cloud.means[:, 2], cloud.sh[:], cloud.scales[:] = 0.25, 1.0, -3.0
     with silent():
@@ -80,7 +76,6 @@ def _moved(cloud, shift, turn=False):
 
 
 def test_usd_round_trip(tmp_path):
-    """Every frame as it was, with what changes at one time only interpolated nowhere else."""
     pytest.importorskip("pxr")
     from pxr import Usd, UsdGeom
 

@@ -30,7 +30,6 @@ OFF = 0.18
 
 
 def _discs(normals, sigma):
-    """Covariances of flat discs across the normals."""
     n = normals[:, :, None]
     flat = EYE - n * n.mT
     return sigma**2 * (flat + 0.01 * n * n.mT)
@@ -76,7 +75,6 @@ def _shell(*surfaces):
 
 @cache
 def _bodies():
-    """Points, normals, volume and area."""
     ball, hollow = _ball(0.5), _shell(_ball(0.5), _ball(0.25))
     torus = _torus(0.4, 0.15)
     tilt = double([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3
@@ -92,7 +90,6 @@ def _bodies():
 
 
 def _body(name):
-    """Points and normals."""
     return _bodies()[name][:2]
 
 
@@ -107,7 +104,6 @@ def _fill(points, normals, spacing=H, sigma=0.6 * H, **settings):
 
 
 def test_density_of_one_gaussian_is_its_formula():
-    """Also the blur, which keeps two of the three standard deviations."""
     mean = double([[0.31, 0.52, 0.47]])
     scales = double([0.08, 0.05, 0.002])
     q, _ = torch.linalg.qr(rand(3, 3))
@@ -142,7 +138,6 @@ def test_directions(count):
 
 @pytest.mark.parametrize("direction", ray_directions(26))
 def test_crossings_are_those_of_a_walk(direction):
-    """Against a walk from cell to cell."""
     dense = torch.rand(6, 7, 8) < 0.3
     odd = odd_crossings(dense, direction)
     for start in torch.cartesian_prod(torch.arange(6), torch.arange(7), torch.arange(8)).tolist():
@@ -181,7 +176,6 @@ def test_open_air_goes_round_corners_but_not_through_walls():
 @pytest.mark.parametrize("normal", [[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [1.0, 1.0, 1.0]])
 @pytest.mark.parametrize("width", [0.75, 1.0, 2.0])
 def test_depth_below_a_plane(normal, width):
-    """Whichever way the plane is turned, to a part of a cell; more where the blur is narrower than a cell."""
     n = torch.tensor(normal)
     n = n / n.norm()
     size = 25
@@ -223,7 +217,6 @@ def _total_volume(filling):
 @pytest.mark.parametrize("name", _bodies())
 @pytest.mark.parametrize("per_cell", [1, 8])
 def test_volume_against_the_closed_form(name, per_cell):
-    """The mean depth of the surface is right to a part of a cell."""
     points, normals, volume, area = _bodies()[name]
     filling = _fill(points, normals, particles_per_cell=per_cell)
     assert abs(_total_volume(filling) - volume) < OFF * H * area
@@ -245,7 +238,6 @@ def test_a_point_is_added_only_where_there_is_no_gaussian():
 
 
 def test_scale_does_not_matter():
-    """A scene in millimetres and one in kilometres get the same points."""
     points, normals = _body("ball")
     small = _fill(points, normals)
     large = _fill(1024 * points, normals, spacing=1024 * H, sigma=0.6 * 1024 * H)
@@ -263,7 +255,6 @@ def test_points_lie_inside_and_holes_stay_empty():
 
 
 def test_which_gaussians_are_on_the_surface():
-    """The outer wall, not that of a closed cavity, and of a solid splat not what lies two cells deep."""
     ball = _ball(0.5)
     points, normals = _body("hollow")
     assert torch.equal(_fill(points, normals).on_surface, torch.arange(len(points)) < len(ball[0]))

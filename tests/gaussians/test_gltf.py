@@ -1,5 +1,3 @@
-"""glTF with KHR_gaussian_splatting: as it was, as others write it, nodes and number types, and what is refused."""
-
 import base64
 import json
 import math
@@ -27,7 +25,6 @@ KHR = "KHR_gaussian_splatting"
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_round_trip(degree, tmp_path):
-    """What was up is y, in metres."""
     cloud = varied_cloud(degree=degree)
     up = torch.tensor([0.3, -0.9, 0.2])
     turn = rotation_from_z(up).T
@@ -54,7 +51,6 @@ def _written(path, document, data):
 
 
 def test_the_file_is_as_the_standard_wants_it():
-    """Bounds of the centres, alignment, unit quaternions, and points in linear light for other programs."""
     cloud = varied_cloud(7, degree=1)
     content = encode_gltf(cloud)
     document, data = glb_parts(content)
@@ -83,7 +79,6 @@ def test_the_file_is_as_the_standard_wants_it():
 
 
 def test_nodes_move_what_they_hold(tmp_path):
-    """Rotation, scale and shift of two nodes and of a matrix; a mesh in two places; stretching along an axis."""
     cloud = varied_cloud(5, degree=2)
     document, data = glb_parts(encode_gltf(cloud, rotation=Y_TO_Z))  # y is up already
     quarter = [0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)]  # about y: z to x
@@ -114,7 +109,6 @@ def test_nodes_move_what_they_hold(tmp_path):
 
 
 def test_numbers_of_every_kind(tmp_path):
-    """Normalised whole numbers, interleaved, in a file beside the .gltf and in its text; two degrees together."""
     rows = np.zeros(3, dtype=[("p", "<f4", 3), ("q", "<i2", 4), ("s", "u1", 3), ("o", "u1"), ("c", "<f4", 3)])
     rows["p"], rows["q"][:, 3], rows["s"], rows["c"] = np.eye(3), 32767, [255, 51, 0], 0.25
     rows["q"][1] = [-32768, 0, 0, 32767]
@@ -155,7 +149,6 @@ def test_numbers_of_every_kind(tmp_path):
 
 
 def _changed(change):
-    """A file of two Gaussians whose document was changed."""
     document, data = glb_parts(encode_gltf(varied_cloud(2, degree=1)))
     change(document, document["meshes"][0]["primitives"][0])
     return document, data
@@ -231,7 +224,6 @@ def test_bad_files(name, tmp_path):
     ],
 )
 def test_data_elsewhere(uri, message, tmp_path):
-    """Only files beside the document are read."""
     (tmp_path / "secret.bin").write_bytes(bytes(1000))
     (tmp_path / "in").mkdir()
     path = tmp_path / "in" / "bad.gltf"
@@ -240,7 +232,6 @@ def test_data_elsewhere(uri, message, tmp_path):
 
 
 def test_one_mesh_many_times(tmp_path):
-    """A few bytes of nodes can announce any number of Gaussians."""
     document, data = _changed(lambda d, p: None)
     document["nodes"] = [{"mesh": 0}] * 20
     document["scenes"] = [{"nodes": list(range(20))}]

@@ -1,5 +1,3 @@
-"""Groups of points for a grid, and specks that hang on nothing."""
-
 import pytest
 import torch
 from shared import longest, rand, seeded
@@ -63,7 +61,6 @@ def test_a_tilted_noisy_sheet_is_not_split():
 
 
 def sheet(count=20):
-    """A square lattice of points, one apart."""
     side = torch.arange(float(count))
     return torch.cartesian_prod(side, side, torch.zeros(1))
 
@@ -88,7 +85,6 @@ def test_small_parts_and_what_hangs_by_a_thread_are_loose(extra, loose):
 
 
 def test_a_thread_holds():
-    """Two sheets joined by single points in a row stay whole, and a row alone loses at most its ends."""
     row = torch.tensor([[0.9, 0.0, 0.0]]) * torch.arange(1, 12)[:, None] + torch.tensor([19.0, 10.0, 0.0])
     other = sheet() + torch.tensor([30.0, 0.0, 0.0])
     assert not loose_points(torch.cat([sheet(), row, other]), 1.0).any()

@@ -1,5 +1,3 @@
-"""Spherical harmonics against associated Legendre polynomials, and their rotation against turned directions."""
-
 import math
 
 import pytest
@@ -66,7 +64,6 @@ def test_evaluation(device, dtype, degree):
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_the_basis_as_one_product(device, dtype, degree):
-    """What a GPU does is what the basis is, with its gradient."""
     directions = unit(50, 3, device=device, dtype=dtype).requires_grad_()
     found, known = harmonics._basis_by_product(directions, degree), sh_basis(directions, degree)
     near(found, known, TOLERANCE[dtype])

@@ -1,5 +1,3 @@
-"""Gaussians of a part, from a seed."""
-
 import dataclasses
 
 import pytest
@@ -23,7 +21,6 @@ def sheet(turned=False, color=(0.5, 0.5, 0.5), shift=(0.0, 0.0, 0.0)):
 
 
 def of(cloud, number):
-    """Whether each Gaussian is one of the hundred of a sheet."""
     return torch.arange(len(cloud)) // 100 == number
 
 
@@ -37,7 +34,6 @@ def test_what_is_apart_is_not_connected():
 
 
 def test_another_colour_or_a_fold_ends_a_part():
-    """Floor, a wall on its edge, and a floor of another colour beside it."""
     floor, wall = sheet(), sheet(turned=True, shift=(0.95, 0.0, 0.0))
     cloud = together(floor, wall, sheet(color=(0.8, 0.4, 0.2), shift=(0.0, 1.0, 0.0)))
     assert connected(cloud, [0.0, 0.0, 0.0]).all()

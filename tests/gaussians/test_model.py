@@ -1,5 +1,3 @@
-"""The model of Gaussians: its parameters, files, deformation and state."""
-
 import pytest
 import torch
 from shared import gradients, value_error

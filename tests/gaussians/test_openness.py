@@ -1,5 +1,3 @@
-"""How open patches are: the weighted areas add up to the outer skin, and free sheets keep theirs."""
-
 import dataclasses
 import math
 
@@ -19,13 +17,11 @@ from gaussian_swaying.scenes.procedural import FlagScene
 
 
 def weights(body):
-    """Weights and the areas that they weigh."""
     areas = coverage_area(body.means, body.normals, body.log_scales, body.opacity)
     return openness(body.means, body.normals, body.log_scales, areas, body.opacity), areas
 
 
 def share(weight, areas, part=slice(None)):
-    """Of the area of a part that counts."""
     return float((weight * areas)[part].sum() / areas[part].sum())
 
 
@@ -110,7 +106,6 @@ def test_areas_of_the_model_are_weighed():
 @pytest.mark.slow(gate=["50-0.96"])
 @pytest.mark.parametrize(("leaves", "least"), [(50, 0.96), (150, 0.9)])
 def test_leaves_that_shade_each_other_keep_most_of_their_area(leaves, least):
-    """A leaf that is reached through a gap counts fully; some leaves are hidden between others from all sides."""
     assert least < share(*weights(bodies.of_cloud(leafy_branch(count=leaves)))) <= 1
 
 
@@ -191,7 +186,6 @@ def test_wild_input_stays_between_the_limits():
 
 
 def test_depths_around_a_place_are_sums_over_its_own_column():
-    """Against a sum over all parts; many sheets and skins reach beyond the ends of their column."""
     draw = seeded(0)
     key = (5 * rand(60, generator=draw)).sort().values
     at = (5 * rand(40, generator=draw)).sort().values

@@ -1,5 +1,3 @@
-"""Labels of a splat: the file, its refusals, and the region of a part."""
-
 import zipfile
 
 import numpy as np

@@ -24,7 +24,6 @@ FIELDS = ("means", "quats", "scales", "opacities", "sh")
 
 
 def _columns(degree=0, count=5, normals=True):
-    """The columns of a valid file, each filled with its own values."""
     names = ["x", "y", "z"] + (["nx", "ny", "nz"] if normals else []) + ["f_dc_0", "f_dc_1", "f_dc_2"]
     names += [f"f_rest_{i}" for i in range(REST[degree])]
     names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
@@ -74,7 +73,6 @@ def test_harmonics_may_be_left_out(tmp_path, degree, kept):
 
 
 def test_a_file_is_read_in_parts(tmp_path, monkeypatch):
-    """Of any number of rows: the last one may be shorter."""
     cloud = varied_cloud(7, degree=1)
     write_ply(tmp_path / "a.ply", cloud)
     header = read_header(tmp_path / "a.ply")
@@ -264,7 +262,6 @@ def _changed(**functions):
 
 
 def _scene():
-    """Sixty Gaussians of a hundredth of the scene, in doubles."""
     columns = {name: column.astype("f8") for name, column in _columns(count=60).items()}
     return columns | {f"scale_{k}": -4 + 0.3 * columns[f"scale_{k}"] for k in range(3)}
 
@@ -289,7 +286,6 @@ UTM = {"x": lambda x: x + 5e5, "y": lambda y: y + 4649776.5}
     ids=["sizes", "doubtful sizes", "opacities", "places"],
 )
 def test_other_units_are_named(columns, refusal, words, tmp_path):
-    """What is impossible is refused, what is doubtful is warned of; doubles far away are neither."""
     path = _write(tmp_path / "a.ply", columns)
     if refusal:
         refused(path, words)
@@ -378,7 +374,6 @@ def test_a_header_that_lies_is_refused_before_the_data(tmp_path):
 
 
 def test_only_the_element_of_the_gaussians_is_read(tmp_path):
-    """Elements before and after it are passed over, lists too if they come after."""
     from gaussian_swaying.scenes.procedural import FlagScene
 
     cloud = FlagScene(spacing=0.3).generate()
@@ -393,7 +388,6 @@ def test_only_the_element_of_the_gaussians_is_read(tmp_path):
 
 
 def test_a_file_that_is_longer_than_its_header_says_is_warned_of(tmp_path):
-    """As where a line of the header was lost, and every number is another's."""
     write_ply(tmp_path / "flag.ply", varied_cloud(7, 3))
     with (tmp_path / "flag.ply").open("ab") as file:
         file.write(bytes(28))

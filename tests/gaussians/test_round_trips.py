@@ -1,5 +1,3 @@
-"""Every format, written and read again: as it was within the bits of each field."""
-
 import math
 import re
 import tracemalloc
@@ -69,7 +67,6 @@ def test_round_trip(kind, degree, tmp_path):
 @pytest.mark.parametrize("degree", [0, 3])
 @pytest.mark.parametrize("kind", ["3.spz", "4.spz", "sog", "glb"])
 def test_reading_takes_no_more_memory_than_is_reckoned(kind, degree, tmp_path):
-    """The bound on what a file may announce counts the peak; torch, which is not traced, has a share of it."""
     if kind == "4.spz":
         pytest.importorskip("zstandard")
     count, path = 20_000, tmp_path / f"a.{kind}"
@@ -107,7 +104,6 @@ WIDE, TINY = {"scales": 7.0}, {"scales": -19.0}
     ],
 )
 def test_what_a_format_cannot_hold_is_counted(kind, changes, words, tmp_path):
-    """In one warning; files that hold any number have none."""
     cloud = varied_cloud()
     for name, value in changes.items():
         if name == "origin":
@@ -159,7 +155,6 @@ def _far(**kinds):
 
 @pytest.mark.parametrize("kind", ["ply", "glb"])
 def test_map_coordinates_survive(kind, tmp_path):
-    """As doubles, or by a node; also what is moved, chosen and joined counts from the origin of the file."""
     cloud, path = _far(), tmp_path / f"a.{kind}"
     export_cloud(path, cloud, rotation=torch.eye(3))
     found = read_gaussians(path)
@@ -183,7 +178,6 @@ def test_float32_map_coordinates_are_read_exactly(tmp_path):
 
 
 def test_splats_with_different_origins_are_joined():
-    """In the origin of all of them, which is none where one of two lies elsewhere."""
     cloud = _far(count=20)
     shifted = cloud.rebased((500120.0, 4649770.0, 300.0))
     both = joined(cloud, shifted)

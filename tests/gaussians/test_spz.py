@@ -79,7 +79,6 @@ def test_far_away_and_tiny(tmp_path):
 
 
 def _body(change=lambda head: None, version=3, degree=0):
-    """A file of two Gaussians with a changed header, uncompressed."""
     data = encode_spz(varied_cloud(2, degree=degree), version)
     data = bytearray(data if version == 4 else gzip.decompress(data))
     change(data)
@@ -198,7 +197,6 @@ def _bomb(count):
 
 @pytest.mark.parametrize(("count", "spare"), [(10_000_000, None), (400_000, 1 << 26)])
 def test_few_bytes_cannot_take_much_memory(count, spare, tmp_path):
-    """Less where others can send a file."""
     (tmp_path / "a.spz").write_bytes(_bomb(count))
     assert (tmp_path / "a.spz").stat().st_size < 20_000
     tracemalloc.start()

@@ -1,5 +1,3 @@
-"""Further points on large Gaussians."""
-
 import math
 
 import pytest
@@ -83,7 +81,6 @@ def test_holes_close_and_areas_add_up():
 
 
 def test_overlapping_ones_do_not_pile_up():
-    """Ten copies of a Gaussian, a little apart, give about as many points as one."""
     means, quats, scales, opacity = _sheet(0.1, 0.1, 0.2)
     one = subdivide(means, quats, scales, opacity, 0.05)
     copies = [t.repeat(10, *[1] * (t.ndim - 1)) for t in (means, quats, scales, opacity)]

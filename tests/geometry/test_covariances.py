@@ -1,5 +1,3 @@
-"""Covariances: from scales and quaternions and back, deformed, and limited in stretch."""
-
 import pytest
 import torch
 from shared import EYE, double, gradients, near, randn, unit
@@ -62,7 +60,6 @@ def test_deformed_covariance_is_that_of_mapped_samples(device, dtype):
 
 
 def _drawn(f, rest, limit=2.0, solid=None):
-    """Covariances after a deformation; of grains."""
     solid = torch.zeros(len(f), dtype=torch.bool, device=f.device) if solid is None else solid
     return deform_all(f, rest, torch.ones_like(f[:, 0]), False, limit, solid)[0]
 
@@ -94,7 +91,6 @@ def test_the_limit_on_stretch_is_reached_without_a_jump():
 
 
 def test_a_solid_beyond_the_limit_goes_back_to_its_own_shape(device, dtype):
-    """A needle torn out a thousandfold stays a needle, turned with the material, where a grain becomes a ball."""
     rest = torch.diag(torch.tensor([4.0, 1.0, 0.01])).expand(4, 3, 3).to(device, dtype)
     turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], device=device, dtype=dtype)
     stretch = torch.tensor([[1.9, 1.0, 1.0], [1.0, 1e3, 1.0], [1.0, 1e3, 1.0], [3.0, 3.0, 3.0]]).to(rest)

@@ -1,5 +1,3 @@
-"""Lines over all directions, and the area of a convex hull from the shadows that it throws."""
-
 import math
 
 import pytest
@@ -21,7 +19,6 @@ def test_lines_are_spread_evenly():
 
 @pytest.mark.parametrize("count", [1, 7, 100])
 def test_lines_are_in_the_middle_of_bands_of_equal_area(count):
-    """The mean square of their heights is that of the midpoint rule with n intervals."""
     found = spread_lines(count)[:, 2].square().mean()
     assert float(found) == pytest.approx(1 / 3 - 1 / (12 * count**2), rel=1e-12)
 

@@ -1,5 +1,3 @@
-"""Signed distances of solids, against brute force and exact values."""
-
 import math
 import os
 
@@ -43,7 +41,6 @@ def _places(count=4000):
 
 @pytest.mark.parametrize("solid", SOLIDS)
 def test_the_gradient_is_that_of_the_distance(solid):
-    """Its norm is one, and the surface lies a distance back along it."""
     place = _places().requires_grad_()
     distance, normal = SOLIDS[solid](place)
     (slope,) = torch.autograd.grad(distance.sum(), place)
@@ -137,7 +134,6 @@ def test_an_open_mesh_is_refused(tmp_path):
 
 
 def _ply(element, *properties, rows=""):
-    """A .ply file as text."""
     lines = ["ply", "format ascii 1.0", element, *(f"property float {name}" for name in properties), "end_header"]
     return "\n".join(lines) + "\n" + rows
 
@@ -178,7 +174,6 @@ def test_a_bad_mesh_is_refused_by_name(tmp_path, name, text, message):
 
 
 def test_a_list_that_claims_four_billion_corners(tmp_path):
-    """A binary list is as long as its first number says."""
     head = _ply("element vertex 1", *"xyz").replace("ascii", "binary_little_endian").removesuffix("end_header\n")
     file = tmp_path / "a.ply"
     file.write_bytes((head + FACE.format("uint double vertex_indices")).encode() + bytes(12) + b"\xff" * 4)
@@ -189,7 +184,6 @@ def test_a_list_that_claims_four_billion_corners(tmp_path):
 @pytest.mark.parametrize("name", ["pipe.ply", "pipe.obj"])
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
 def test_a_pipe_is_no_mesh(tmp_path, name):
-    """Reading one waits for ever."""
     os.mkfifo(tmp_path / name)
     with value_error("not a regular file"):
         read_mesh(tmp_path / name)

@@ -1,5 +1,3 @@
-"""Scene units to metres and back, against closed forms."""
-
 import dataclasses
 
 import pytest
@@ -40,7 +38,6 @@ def test_up_is_minus_y_has_a_closed_form():
 
 @pytest.mark.parametrize("up", UPS)
 def test_there_and_back(up):
-    """The box along the simulation's axes has the longest side asked for and its centre at the origin."""
     placed = SimFrame.fit(_points(), up, longest_side=1.5).point_to_sim(_points())
     low, high = placed.amin(0), placed.amax(0)
     assert float((high - low).amax()) == pytest.approx(1.5, rel=1e-12)
@@ -82,7 +79,6 @@ def test_metres_per_unit_is_taken_as_it_is():
 
 
 def test_what_a_frame_keeps_is_its_own():
-    """Another origin, unit or rotation in a copy, another type and a gradient after an inference."""
     with torch.inference_mode():
         frame = SimFrame.fit(_points(), [0, 1, 0], metres_per_unit=2.0)
         frame.point_to_sim(_points())

@@ -1,5 +1,3 @@
-"""Equal rows, against torch.unique."""
-
 import pytest
 import torch
 from shared import randn

@@ -63,7 +63,6 @@ def test_polar_rotation_is_objective(device):
 
 
 def test_polar_gradient_at_identity():
-    """An SVD gives NaN here; the derivative of R at I is the skew part of the perturbation."""
     F = EYE.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(polar_rotation(F)[0, 1], F)
     expected = torch.zeros(3, 3).double()
@@ -156,7 +155,6 @@ def test_shapes():
 
 
 def _log_sum(a):
-    """A function that couples the stretches."""
     return a.log() + 0.3 * a.log().sum(-1, keepdim=True) + 0.1 * a.square()
 
 
@@ -197,7 +195,6 @@ def test_isotropic_functions_of_inverted_matrices():
 
 
 def test_isotropic_functions_that_are_known(device, dtype):
-    """The square is S S, the identity S; and the value does not depend on whether a gradient is wanted."""
     F = _matrices(device, dtype)
     tol = JACOBI * torch.finfo(dtype).eps * float(peak(F)) ** 2
     parts = spectrum(F)

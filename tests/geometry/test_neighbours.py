@@ -1,5 +1,3 @@
-"""The neighbour search against all distances."""
-
 import pytest
 import torch
 from shared import peak, randn
@@ -9,7 +7,6 @@ from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
 
 def _uneven(count):
-    """Density that varies by orders of magnitude, and a point far away."""
     points = randn(count, 3) * torch.logspace(-4, 1, count, dtype=torch.float64)[:, None]
     points[0] = 1e5
     return points
@@ -29,7 +26,6 @@ def test_among_themselves():
 
 @pytest.mark.parametrize("count", [1, 5])
 def test_from_other_places(count):
-    """Inside, on, and far outside the points."""
     points = _uneven(1500)
     queries = torch.cat([randn(300, 3), points[10:20], torch.tensor([[-3e6, 0, 1.0]]).double()])
     distance, index = nearest_neighbours(points, count, queries)

@@ -1,5 +1,3 @@
-"""The origin of places far from zero."""
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-"""Normals and areas of patches against mapped planes and inverses, in torch and in the kernel."""
-
 import pytest
 import torch
 from shared import EYE, alike, double, gradients, near, rand, randn, unit
@@ -16,8 +14,6 @@ UP = double([0.0, 0.0, 1.0])
 
 
 def test_deformed_normal_and_area_match_a_mapped_plane():
-    """Finite differences of x(u, v) on a curved map: the normal and the area of the image of the plane."""
-
     def curved(x):
         a, b, c = x.unbind(-1)
         return torch.stack([a + 0.3 * torch.sin(2 * b) + 0.2 * c, b + 0.4 * a * a, c + 0.5 * torch.cos(a + b)], dim=-1)
@@ -62,7 +58,6 @@ def test_deformed_normal_of_singulargradients(device, dtype):
 
 
 def test_everything_at_once_is_each_by_itself(device, dtype):
-    """On a GPU in one kernel, if triton is there: turned over, flattened and undeformed patches included."""
     f = gradients(60, device, dtype)
     f[1] = torch.diag(torch.tensor([2.0, 3.0, 0.0]))
     f[2] = 1e-12 * torch.eye(3)

@@ -1,5 +1,3 @@
-"""Regions and the choice of what is simulated."""
-
 import copy
 
 import pytest
@@ -68,7 +66,6 @@ def test_batches_and_devices(region, device, dtype):
 
 
 def test_a_copied_region_is_asked_anew():
-    """Corners are kept as tensors, but only for the numbers that they were made of."""
     box, point = Box([0, 0, 0], [1, 1, 1]), torch.tensor([[1.5, 0.5, 0.5]])
     assert box.contains(point).tolist() == [False]
     box = changed(box, max=(2.0, 1.0, 1.0))

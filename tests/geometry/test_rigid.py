@@ -1,5 +1,3 @@
-"""The motion of a rigid body from the momentum of its points."""
-
 import pytest
 import torch
 from shared import double, near, peak, rand, randn, seeded
@@ -25,7 +23,6 @@ def distances(place):
 
 @pytest.mark.parametrize("dt", [1e-4, 1e-2, double(0.03)])
 def test_momenta_and_distances_stay(dt):
-    """Also in turns of several degrees in a substep: the velocity leads along the chord."""
     moved = rigid_velocity(PLACE, VELOCITY, MASS, dt)
     for found, given in zip(momenta(PLACE, moved), momenta(PLACE, VELOCITY), strict=True):
         near(found, given, 1e-11)

@@ -1,5 +1,3 @@
-"""Quaternions and rotation matrices."""
-
 import torch
 from shared import near, randn, seeded, unit
 from torch.testing import assert_close

@@ -1,5 +1,3 @@
-"""Normals from neighbours, on surfaces whose normals are known."""
-
 import math
 
 import torch

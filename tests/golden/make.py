@@ -39,7 +39,6 @@ def scale(key, values):
 
 
 def record(name, folder):
-    """The arrays of a file."""
     kernels, frame = run(name, folder, device="cpu")
     if name == "modes":
         for path in folder.glob("**/modes_*.npz"):

@@ -66,8 +66,6 @@ def captured(folder):
 
 
 def labelled(*parts, **more):
-    """Settings that cut a flag into strips along x, each of which is a part."""
-
     def settings(folder):
         x = FlagScene(spacing=0.05).generate().means[:, 0].contiguous()
         Parts(torch.bucketize(x, torch.tensor([0.16, 0.46, 0.76])), parts).save(folder / "parts.npz")
@@ -240,7 +238,6 @@ def parser():
 
 
 def simulation_of(name, folder, **arithmetic):
-    """The simulation of a case."""
     files, settings = CASES[name]
     small = {"camera.init_args.width": 64, "camera.init_args.height": 48, **arithmetic}
     settings = small | (settings(folder) if callable(settings) else settings)
@@ -251,7 +248,6 @@ def simulation_of(name, folder, **arithmetic):
 
 
 def frames_of_batch(simulation):
-    """Places and squared stretches of the points of three runs in one rollout, the first of them as it is."""
     model = simulation.model
     batch = simulation.batch([model, model.at("wind.speed", 9.0), model.at("material.E", 2e4)])
     state = batch.start()
@@ -262,7 +258,6 @@ def frames_of_batch(simulation):
 
 
 def frames_of(name, folder, **arithmetic):
-    """Means, covariances, health, and the frame itself, frame by frame."""
     simulation = simulation_of(name, folder, **arithmetic)
     if name == "batch":
         yield from frames_of_batch(simulation)

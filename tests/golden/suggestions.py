@@ -66,7 +66,6 @@ CASES = {
 
 
 def numbers_of(name):
-    """The numbers of a suggestion."""
     make, options = CASES[name]
     found = suggest(make(), **{"quality": "draft", "device": "cpu", **options})
     simulation, natural, parts = found.simulation, found.natural, found.parts

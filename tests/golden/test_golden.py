@@ -59,7 +59,6 @@ def test_torch(name, folder):
 
 
 def test_every_shipped_configuration_has_a_case():
-    """But for those of training, fits and sweeps."""
     used = {f"{name}.yaml" for files, _ in CASES.values() for name in files}
     paths = {
         path.relative_to(CONFIGS).as_posix() for room in ("sim", "bench") for path in CONFIGS.rglob(f"{room}/**/*.yaml")

@@ -10,7 +10,6 @@ from gaussian_swaying.simulation.simulation import Simulation
 
 
 def test_a_mac_computes_on_its_cpu(tmp_path, monkeypatch):
-    """Its kernels are there. With no CUDA, torch looks for streams on MPS, which has none."""
     monkeypatch.setattr("torch.backends.mps.is_available", lambda: True)
     simulation = Simulation(FlagScene(spacing=0.1), device="auto", recorder=Recorder(renders=()))
     assert simulation.device.type == "cpu"
@@ -26,7 +25,6 @@ def test_a_mac_computes_on_its_cpu(tmp_path, monkeypatch):
     ids=["mac", "linux"],
 )
 def test_the_kernels_of_a_run_compile_for_arm64(triple, processor, head, tmp_path, monkeypatch):
-    """All that LLVM has to know of another processor is its name."""
     texts, plain = [], cpu._compiled
     monkeypatch.setattr(cpu, "cache_folder", lambda: tmp_path)
     monkeypatch.setattr(cpu, "_COMPILED", {})

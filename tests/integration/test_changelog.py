@@ -1,5 +1,3 @@
-"""Changes that wait in changelog.d reach CHANGELOG.md."""
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""The main job on a GPU: the same command, the same motion, resumed there too."""
-
 import json
 from pathlib import Path
 

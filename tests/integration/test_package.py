@@ -28,7 +28,6 @@ def _python(*arguments, **environment):
 
 
 def test_every_public_name_is_found_in_its_home():
-    """About forty of them, in one list."""
     stub = ast.parse((ROOT / "gaussian_swaying" / "__init__.pyi").read_text())
     listed = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
     homes = {node.module: [a.name for other in listed if other.module == node.module for a in other.names]
@@ -45,7 +44,6 @@ def test_every_public_name_is_found_in_its_home():
 
 
 def test_import_is_light_and_every_module_imports_without_the_heavy_libraries():
-    """gsplat, lightning and the readers of files are loaded where they are used."""
     modules = [
         ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
         for path in sorted((ROOT / "gaussian_swaying").rglob("*.py"))
@@ -71,7 +69,6 @@ def test_import_is_light_and_every_module_imports_without_the_heavy_libraries():
 
 
 def test_a_run_imports_only_what_it_needs(tmp_path):
-    """On a CPU, with pictures and a video; each of these takes a tenth of a second or more."""
     heavy = ["cv2", "gsplat", "imageio", "lightning", "matplotlib", "pandas", "PIL.TiffImagePlugin", "scipy.optimize"]
     heavy += ["scipy.stats", "setuptools", "sympy", "torch._dynamo", "torch._inductor", "torch.utils.cpp_extension"]
     heavy += ["torchmetrics", "triton", "aiohttp"]
@@ -84,7 +81,6 @@ def test_a_run_imports_only_what_it_needs(tmp_path):
 
 
 def test_every_dependency_is_pinned():
-    """constraints.txt pins all that the README's test command installs, at versions that pyproject.toml allows."""
     tomllib = pytest.importorskip("tomllib", reason="needs Python 3.11")
     from packaging.requirements import Requirement
 

@@ -1,5 +1,3 @@
-"""README names files and numbers that exist, and every page is linked."""
-
 import json
 import re
 from pathlib import Path
@@ -31,7 +29,6 @@ def test_every_page_is_linked_and_every_link_leads_somewhere():
 
 
 def test_the_package_index_gets_no_link_to_a_file_beside_the_readme():
-    """The substitutions of pyproject.toml, which the build applies to the README of the package."""
     project = pytest.importorskip("tomllib").loads((ROOT / "pyproject.toml").read_text())
     text = README
     for change in project["tool"]["hatch"]["metadata"]["hooks"]["fancy-pypi-readme"]["substitutions"]:
@@ -42,7 +39,6 @@ def test_the_package_index_gets_no_link_to_a_file_beside_the_readme():
 
 
 def _recorded(device, name):
-    """Numbers of the last whole run of this name on such a device."""
     lines = [json.loads(line) for line in (RESULTS / "runs.jsonl").read_text().splitlines()]
     own = [line for line in lines if device.lower() in line["device"].lower() and name in line["parameters"]["name"]]
     return own[-1]["numbers"]

@@ -27,7 +27,6 @@ def _arguments(folder, *more):
 
 
 def _at(monkeypatch, frame, act):
-    """Call a function with the run when it begins to record a frame."""
     record = Run.record
 
     def acting(self, state, number):
@@ -60,14 +59,12 @@ def _same_as_uninterrupted(folder, other):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """A run from start to end."""
     folder = tmp_path_factory.mktemp("whole") / "run"
     assert main(_arguments(folder)) == 0
     return folder
 
 
 def test_a_stopped_run_continues_bit_for_bit(tmp_path, monkeypatch, capsys):
-    """From a checkpoint that is older than the last frame."""
     more = ["--solver.formulation=updated", "--recorder.checkpoint_every=2"]
     folder, other = tmp_path / "run", tmp_path / "whole"
     assert main(_arguments(other, *more)) == 0
@@ -103,7 +100,6 @@ def test_a_killed_run_continues_bit_for_bit(whole, tmp_path, monkeypatch):
 @pytest.mark.skipif(os.name == "nt", reason="sends SIGTERM")
 @pytest.mark.usefixtures("default_signals")
 def test_a_run_that_is_told_to_end(whole, tmp_path, monkeypatch, capsys):
-    """It holds its folder while it lives; then it ends in order, with its video, and names the command to go on."""
     folder = tmp_path / "run"
 
     def end(run):
@@ -127,7 +123,6 @@ def test_a_run_that_is_told_to_end(whole, tmp_path, monkeypatch, capsys):
 
 
 def test_ctrl_c_while_frames_wait_for_the_disk(tmp_path, monkeypatch):
-    """They are written before the run ends."""
     ends, write, close = threading.Event(), recorder.save_png, recorder.Recorder.close
     monkeypatch.setattr(recorder, "save_png", lambda *given: (ends.wait(60), write(*given)))
     monkeypatch.setattr(recorder.Recorder, "close", lambda *given, **more: (ends.set(), close(*given, **more))[1])

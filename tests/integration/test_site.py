@@ -1,5 +1,3 @@
-"""The site is built without a warning, and its reference has a complete entry for each public name."""
-
 import ast
 import html
 import importlib
@@ -19,7 +17,6 @@ STUB = ROOT / "gaussian_swaying" / "__init__.pyi"
 
 
 def public_names():
-    """The public names, each with the module it comes from."""
     for node in ast.parse(STUB.read_text("utf-8")).body:
         if isinstance(node, ast.ImportFrom):
             yield from ((alias.name, f"gaussian_swaying.{node.module}") for alias in node.names)
@@ -70,7 +67,6 @@ def test_pages_ask_no_other_site(site):
 
 
 def test_every_public_name_is_described():
-    """A summary, and each argument of its own; those of a base class are described there."""
     missing = []
     for name, home in NAMES.items():
         found = getattr(importlib.import_module(home), name)

@@ -1,6 +1,7 @@
 """A small printed flag in the wind."""
 
 import pytest
+from handheld_films import write_base
 
 from gaussian_swaying.inverse.fit import Problem, fit
 from gaussian_swaying.inverse.plan import Plan, read_unknown
@@ -16,8 +17,8 @@ def simulation(own):
 
 @pytest.fixture
 def brief(monkeypatch):
-    """Fits end before Gaussians are matched."""
-    monkeypatch.setattr("gaussian_swaying.inverse.fit.STEPS", (("tracks", 0.25), ("tracks", 0.5), ("tracks", 1.0)))
+    """Gaussians are matched once."""
+    monkeypatch.setattr("gaussian_swaying.inverse.fit.STEPS", (1.0,))
 
 
 @pytest.fixture
@@ -51,3 +52,15 @@ def fitted(own, tmp_path):
         return fit(own / "base.yaml", folder or own / "video", unknowns, tmp_path / "fit", **options)
 
     return fitted
+
+
+@pytest.fixture(scope="session")
+def walls(tmp_path_factory):
+    """The configuration of a flag in front of two walls."""
+    return write_base(tmp_path_factory.mktemp("walls"), wall=0.04)
+
+
+@pytest.fixture
+def room(walls):
+    """Its simulation."""
+    return Simulation.from_yaml(walls, device="cpu")

@@ -17,17 +17,8 @@ from gaussian_swaying.simulation.simulation import Simulation
 pytest.importorskip("cv2", reason="needs the extra [fit]")
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("background")
-    write_base(folder, wall=0.04)
-    return folder
-
-
-def test_what_moves_and_what_it_may_reach_is_left_out(folder):
-    simulation = Simulation.from_yaml(folder / "base.yaml", device="cpu")
-    scene, camera = simulation.scene, tripod(320, 180)
-    background = Background(simulation)
+def test_what_moves_and_what_it_may_reach_is_left_out(room):
+    scene, camera, background = room.scene, tripod(320, 180), Background(room)
     assert background.exists
     _picture, still = background.draw(camera)
     assert still.shape == (180, 320)
@@ -41,8 +32,8 @@ def test_what_moves_and_what_it_may_reach_is_left_out(folder):
     assert still[middle, : left - (right - left) // 2].all()
 
 
-def test_a_part_that_moves_too_is_left_out(folder):
-    cloud = Scene(ply=folder / "room.ply").cloud()
+def test_a_part_that_moves_too_is_left_out(walls):
+    cloud = Scene(ply=walls.parent / "room.ply").cloud()
     far = cloud.means[:, 1] > 0.3
     near = (cloud.means[:, 1].abs() < 0.05) & (cloud.means[:, 0] < 0.5)
     labels = torch.where(near, 0, torch.where(far, 1, 2))

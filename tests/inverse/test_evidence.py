@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gaussian_swaying.inverse.evidence import LEAST_FACING, PATCHES, Evidence, compare, facing
+from gaussian_swaying.inverse.evidence import LEAST_FACING, PATCHES, Evidence, compare, explained, facing
 from gaussian_swaying.inverse.tracks import Tracks
 from gaussian_swaying.inverse.variants import states_of
 from gaussian_swaying.inverse.videos import read_videos
@@ -32,6 +32,21 @@ def test_residuals_are_those_in_pixels_times_their_weight(own, simulation):
     expected = facing(simulation.scene.rest().normals[simulation.scene.moving], evidence.rest, left.cameras[0])
     assert expected.min() < 0.95
     torch.testing.assert_close(evidence.beside(shown, 0)[0], evidence.pixels(shown, 0) * expected[:, None])
+
+
+def test_a_track_that_slips_explains_nothing_and_no_less(own, simulation):
+    """Of four points one stays within a pixel or two of where it was, and the simulation goes far."""
+    video, _ = read_videos(own / "video")
+    whole, states = _nothing(simulation, video), states_of(simulation, [{}], video.times)
+    position = torch.stack([whole.pixels(whole.shown(one), k)[0, -4:] for k, one in enumerate(states)]).double()
+    moved = (position - position[:1]).square().sum((0, 2))
+    position[1:, 3] = position[0, 3] + 1.0
+    slipped = 2.0 * (len(position) - 1)
+    assert moved[3] > 10 * slipped
+    seen = torch.ones(position.shape[:2], dtype=torch.bool)
+    tracks = Tracks(torch.arange(len(simulation.scene.moving))[-4:], position, seen)
+    found = explained(simulation, [video], [tracks], {}, video.times)[video.name]
+    assert found == pytest.approx(float(moved[:3].sum() / (moved[:3].sum() + slipped)), rel=1e-3)
 
 
 def test_tracks_share_their_clusters_over_cameras(own, simulation):

@@ -2,22 +2,20 @@
 
 import pytest
 import torch
-from handheld_films import drift, tripod, write_base
+from handheld_films import drift, tripod
 from shared import peak, seeded
 
 from gaussian_swaying.inverse.hand import Background, gain_of, gains, with_gains
 from gaussian_swaying.inverse.videos import Footage
-from gaussian_swaying.simulation.simulation import Simulation
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")
 
 FRAMES = 5
 
 
-@pytest.fixture(scope="module")
-def background(tmp_path_factory):
-    base = write_base(tmp_path_factory.mktemp("exposure"), wall=0.04)
-    return Background(Simulation.from_yaml(base, device="cpu"))
+@pytest.fixture
+def background(room):
+    return Background(room)
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
 """A film that is still at first or begins in motion: the time at which the motion starts is one more unknown."""
 
 import json
-import shutil
 from dataclasses import replace
 
 import pytest
@@ -22,36 +21,25 @@ STILL, CUT = 4, 3  # frames
 SPEED, AZIMUTH = {"wind.speed": [2.0, 12.0]}, {"wind.azimuth": [-60.0, 150.0]}
 
 
-@pytest.fixture
-def late(own, tmp_path):
-    """The video of the flag after some frames in which nothing moves."""
-    folder = tmp_path / "late"
-    shutil.copytree(own / "video", folder)
-    file = folder / "transforms.json"
-    frames = json.loads(file.read_text())["frames"]
-    first = [frame for frame in frames if frame["time"] == 0]
-    moved = [frame | {"time": frame["time"] + STILL / 24} for frame in frames]
-    still = []
-    for k in range(STILL):
-        for frame in first:
-            name = f"still{k}_{frame['file_path']}"
-            shutil.copy(folder / frame["file_path"], folder / name)
-            still.append(frame | {"file_path": name, "time": k / 24})
-    file.write_text(json.dumps({"frames": [*still, *moved]}))
+def _later(own, folder, frames):
+    """The video of the flag so many frames later, at rest until then; below 0, without its first frames."""
+    found = []
+    for frame in json.loads((own / "video/transforms.json").read_text())["frames"]:
+        frame["file_path"] = str(own / "video" / frame["file_path"])
+        first = 0 if frame["time"] == 0 else frames + round(24 * frame["time"])
+        found += [frame | {"time": k / 24} for k in range(first, frames + round(24 * frame["time"]) + 1) if k >= 0]
+    (folder / "transforms.json").write_text(json.dumps({"frames": found}))
     return folder
 
 
 @pytest.fixture
-def cut(own, tmp_path):
-    """The video of the flag without its first frames."""
-    file = own / "video/transforms.json"
-    frames = [frame for frame in json.loads(file.read_text())["frames"] if frame["time"] > (CUT - 0.5) / 24]
-    for frame in frames:
-        frame["time"] -= CUT / 24
-        frame["file_path"] = str(own / "video" / frame["file_path"])
-    (tmp_path / "cut").mkdir()
-    (tmp_path / "cut/transforms.json").write_text(json.dumps({"frames": frames}))
-    return tmp_path / "cut"
+def late(own, tmp_path_factory):
+    return _later(own, tmp_path_factory.mktemp("late"), STILL)
+
+
+@pytest.fixture
+def cut(own, tmp_path_factory):
+    return _later(own, tmp_path_factory.mktemp("cut"), -CUT)
 
 
 def test_the_start_of_the_motion_is_found(late, fitted, tmp_path):
@@ -162,7 +150,7 @@ def test_starts_that_are_compared_at_once(own, simulation):
     times, starts = list(video.times[:5]), [-2 / 24, 0.0, 1 / 24]
     together = compare_starts(simulation, evidence, [{"wind.speed": 4.0}], times, starts)
     apart = [{"wind.speed": 4.0, FILM_START: start} for start in starts]
-    block = compare(simulation, evidence, apart, times, careful=False, moving=True)
+    block = compare(simulation, evidence, apart, times, moving=True)
     for number, own_block in enumerate(together):
         assert own_block.values[0].shape == block.values[number].shape
         assert peak(own_block.values[0] - block.values[number]) < 0.02  # other steps

@@ -1,5 +1,3 @@
-"""What tests of the compiler of kernels share."""
-
 import pytest
 
 from gaussian_swaying.kernels import cpu

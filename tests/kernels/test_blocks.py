@@ -175,7 +175,6 @@ REAL = BOTH | {
 
 @pytest.mark.parametrize("kind", [torch.int32, torch.int64, torch.float32, torch.float64], ids=str)
 def test_operations(kind, block):
-    """Also of NaN and infinity."""
     x, y = _real(kind) if kind.is_floating_point else _whole(kind)
     for found, expected in _rows(REAL if kind.is_floating_point else WHOLE, x, y, kind, block):
         _same(found, expected(x, y))
@@ -223,7 +222,6 @@ def _off(name, x):
 
 
 def test_exp_and_log_are_within_two_units_of_the_last_place():
-    """Of denormal numbers, too."""
     x = torch.cat([torch.linspace(-104, 88.72, 400_001), torch.linspace(-1, 1, 100_001), torch.tensor([1e-30, -1e-30])])
     assert _off("exponential", x).max() < 2
     draw = seeded(1)
@@ -248,7 +246,6 @@ def test_special_numbers_of_exp_and_log(block):
 
 @pytest.mark.parametrize("kind", [torch.int32, torch.int64, torch.float32, torch.float64], ids=str)
 def test_comparisons(kind, block):
-    """NaN differs from all numbers, and neither is less."""
     x, y = _real(kind) if kind.is_floating_point else _whole(kind)
     x[7] = y[7]
     found = torch.stack([x < y, x <= y, x > y, x >= y, x == y, x != y])
@@ -257,7 +254,6 @@ def test_comparisons(kind, block):
 
 
 def test_logic(block):
-    """True + true is two."""
     x, y = torch.tensor([1, 1, -1, -1] * 3, dtype=torch.int32), torch.tensor([1, -1, 1, -1] * 3, dtype=torch.int32)
     a, b = x > 0, y > 0
     rows = torch.stack([a & b, a | b, a ^ b, ~a, ~b, a & b, a | b]).int()
@@ -391,7 +387,6 @@ def test_blocks_of_one_number(block):
 
 @triton.jit
 def _places(x_in, out, n, one, BLOCK: tl.constexpr):
-    """Loads of all kinds, a row each; n is three."""
     lane = tl.arange(0, BLOCK)
     row = out + lane
     tl.store(row, tl.load(x_in + 2 + lane))
@@ -407,7 +402,6 @@ def _places(x_in, out, n, one, BLOCK: tl.constexpr):
 
 
 def test_where_loads_read(block):
-    """Neighbours, rows, columns, backwards, one for all, and any other places."""
     x, out = torch.randn(40), torch.zeros(10, block)
     launch(_places, (1,))(x, out, 3, 1, BLOCK=block)
     k = torch.arange(block)
@@ -434,7 +428,6 @@ def _masked(x_in, n, first, strided, scattered, single, missing, BLOCK: tl.const
 
 @pytest.mark.parametrize("n", [1, 5, 8])
 def test_masks(n, block):
-    """Nothing is read or written where a mask is false, however far away it is."""
     x, out = torch.randn(16), torch.full((4, block), 77.0)
     strided, scattered, single = torch.full((16,), 77.0), torch.full((block + 1,), 77.0), torch.zeros(2)
     launch(_masked, (1,))(x, n, out, strided, scattered, single, torch.zeros(1), BLOCK=block)
@@ -464,7 +457,6 @@ def _truth(given, out, n, BLOCK: tl.constexpr):
 
 
 def test_tensors_of_truth(block):
-    """One byte each, zero or one."""
     given, out = torch.tensor([True, False, True, True, False, False, True, True]), torch.zeros(18, dtype=torch.bool)
     launch(_truth, (1,))(given, out, 7, BLOCK=block)
     seen = given[:block] & (torch.arange(block) < 7)
@@ -491,7 +483,6 @@ def _atomics(real, whole, before, where, value, n, BLOCK: tl.constexpr):
 
 @pytest.mark.parametrize("kind", [torch.float32, torch.float64], ids=str)
 def test_atomic_operations(kind, block):
-    """Several lanes of one program add to one number; each gets what was there before it."""
     where = torch.tensor([0, 1, 1, 3, 1, 0, 3, 3, 1, 0, 1] + [0] * 5, dtype=torch.int32)
     value = torch.arange(-5, 11).to(kind)
     real, whole = torch.zeros(8, dtype=kind), torch.zeros(8, dtype=torch.int64)

@@ -1,5 +1,3 @@
-"""Kernels that are compiled for this processor: the cache on disk, threads, and recordings."""
-
 import importlib
 import os
 import shutil
@@ -46,7 +44,6 @@ def _count_compiled(monkeypatch):
 
 
 def test_a_kernel_is_compiled_once(folder, monkeypatch):
-    """For each set of constants and of types of its arguments, not for each value."""
     compiled = _count_compiled(monkeypatch)
     for by in (1.0, 2.0, 5):
         assert torch.equal(_shifted(by), EXPECTED - 1 + by)
@@ -90,7 +87,6 @@ def number():
 
 @pytest.fixture
 def own(tmp_path, monkeypatch):
-    """A function that imports a kernel from a file, as if for the first time, and returns what it adds."""
     (tmp_path / "own_kernel.py").write_text(OWN)
     (tmp_path / "own_numbers.py").write_text(NUMBERS)
     monkeypatch.syspath_prepend(tmp_path)
@@ -108,7 +104,6 @@ def own(tmp_path, monkeypatch):
 
 
 def test_a_second_process_compiles_nothing(folder, own, tmp_path, monkeypatch, capsys):
-    """The first one can say what it did, but prints nothing."""
     monkeypatch.setattr(cpu, "_spent", [0, 0.0, 0.0])
     assert cpu.compiled_sentence(0) is None
     assert own() == 101.0
@@ -141,7 +136,6 @@ def test_a_second_process_compiles_nothing(folder, own, tmp_path, monkeypatch, c
     ids=["kernel", "function that is passed", "constant", "function of another file", "host", "comment elsewhere"],
 )
 def test_a_change_of_the_source_counts(folder, own, tmp_path, file, old, new, expected):
-    """Also of what a kernel calls and names in other files, but not of what is beside it."""
     assert own() == 101.0
     path = tmp_path / file
     path.write_text(path.read_text().replace(old, new))
@@ -150,7 +144,6 @@ def test_a_change_of_the_source_counts(folder, own, tmp_path, file, old, new, ex
 
 
 def test_a_change_of_the_translator_counts_and_one_of_another_room_does_not(folder, own, tmp_path, monkeypatch):
-    """For kernels of the whole package, of which this is a copy."""
     package = Path(cpu.__file__).parents[1]
     copy = shutil.copytree(package, tmp_path / "package", ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.setattr(cpu, "__file__", str(copy / "kernels" / "cpu.py"))
@@ -175,7 +168,6 @@ def test_a_broken_file_is_replaced(folder, broken):
 
 
 def test_the_folder_need_not_be_writable(tmp_path, monkeypatch):
-    """As where the home folder is on a read-only disk: here a file stands in the way."""
     (tmp_path / "file").touch()
     monkeypatch.setattr(cpu, "cache_folder", lambda: tmp_path / "file" / "kernels")
     monkeypatch.setattr(cpu, "_COMPILED", {})
@@ -213,7 +205,6 @@ def _note_thread(out, turns):
 
 
 def test_several_threads_work(use_threads):
-    """A crew of three has two threads of its own, which sleep afterwards."""
     use_threads(3)
     out = torch.zeros(600)
     launch(_note_thread, (600,))(out, 10)
@@ -230,7 +221,6 @@ def _neighbours(x, y, n):
 
 @pytest.mark.parametrize("number", [1, 2, 3])
 def test_a_launch_sees_what_the_one_before_has_written(use_threads, number):
-    """Also the parts that other threads wrote: a program reads the number of its neighbour."""
     use_threads(number)
     n, turns = 64, 200
     x, y = torch.zeros(2, n, dtype=torch.int64)
@@ -259,7 +249,6 @@ def test_fewer_programs_than_threads(use_threads):
 
 
 def test_launches_from_several_threads_of_python(folder, use_threads):
-    """They take turns; one compiles, and a recording holds those of its own thread alone."""
     use_threads(2)
     found, recorded, start = {}, {}, threading.Barrier(4)
 
@@ -299,7 +288,6 @@ assert torch.equal(_shifted(), EXPECTED)
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 def test_a_process_that_was_forked_has_threads_of_its_own(tmp_path):
-    """Those of its parent did not come along."""
     command = [sys.executable, "-c", FORK.format(here=str(HERE))]
     given = os.environ | {"GAUSSIAN_SWAYING_CACHE": str(tmp_path)}
     made = subprocess.run(command, env=given, capture_output=True, text=True, timeout=120, check=False)
@@ -315,7 +303,6 @@ def _advance(x, factor):
 
 
 def test_a_recording_is_replayed_in_order():
-    """Launches, and functions between them, all with the tensors as they are then."""
     x, count = torch.ones(1), torch.zeros(1)
     device = x.device
     with cpu.recording() as made:
@@ -338,7 +325,6 @@ def test_a_recording_is_replayed_in_order():
 
 
 def test_a_recording_keeps_its_tensors():
-    """Also those that nobody else knows; after `reset` no more."""
     x = torch.ones(1)
     with cpu.recording() as made:
         own = torch.full((1,), 4.0)
@@ -357,7 +343,6 @@ def _add_to(x, y):
 
 
 def test_recordings_within_recordings():
-    """The inner one alone records; the outer one goes on afterwards, also after an error."""
     x = torch.zeros(1)
     with cpu.recording() as outer:
         launch(_advance, (1,))(x, 1.0)
@@ -376,7 +361,6 @@ def test_recordings_within_recordings():
 
 
 def test_numbers_and_tensors_of_all_types_are_passed():
-    """A kernel is compiled for the types of its tensors."""
     for kind in (torch.float32, torch.float64, torch.int32, torch.int64, torch.int8):
         x = torch.full((1,), 5, dtype=kind)
         launch(_advance, (1,))(x, 3)
@@ -393,7 +377,6 @@ def _precise(x, out, tenth):
 
 
 def test_double_precision():
-    """Of all numbers of a kernel that gets tensors of it and none of single precision."""
     x, out = torch.tensor([1]), torch.zeros(1).double()
     launch(_precise, (1,))(x, out, 0.1)
     assert abs(float(out) - (1 / 3 + 0.3)) < 1e-15

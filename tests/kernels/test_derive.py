@@ -1,5 +1,3 @@
-"""Device functions on tensors and on symbols, and those that are derived from them."""
-
 import pytest
 import torch
 from shared import double, rand, randn, seeded
@@ -24,7 +22,6 @@ LEAST = tl.constexpr(0.05)
 
 @triton.jit
 def root(x):
-    """A square root that a caller does not look into."""
     return tl.sqrt(x)
 
 
@@ -36,7 +33,6 @@ root_of = on_tensors(root)
 
 @triton.jit
 def formula(a, s, p, SQUARED: tl.constexpr):
-    """Everything that formulas are made of."""
     zero = 0.0 * s
     total = zero
     for k in tl.static_range(3):
@@ -50,7 +46,6 @@ def formula(a, s, p, SQUARED: tl.constexpr):
 
 @triton.jit
 def branching(x, y):
-    """A branch that depends on a value."""
     if x > 0:
         y = -y
     return y
@@ -58,7 +53,6 @@ def branching(x, y):
 
 @triton.jit
 def loading(x):
-    """A look-up."""
     return tl.load(x)
 
 
@@ -97,7 +91,6 @@ def test_the_adjoint_is_the_gradient():
 
 @triton.jit
 def kernel(x, out, count, ADJOINT: tl.constexpr, BLOCK: tl.constexpr):
-    """A derived function in a kernel."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = index < count
     a = (tl.load(x + index, mask), tl.load(x + count + index, mask), tl.load(x + 2 * count + index, mask))
@@ -163,7 +156,6 @@ def test_a_divided_difference_does_not_cancel():
 
 @triton.jit
 def looked_up(table, x, mask, STEP: tl.constexpr):
-    """Two numbers of a table in a row."""
     first = table + tl.floor(x).to(tl.int32) * STEP
     return tl.load(first, mask, -1.0), tl.load(first + 1, mask, -1.0)
 
@@ -182,7 +174,6 @@ def test_the_gradient_of_a_length_is_zero_at_zero():
 
 @triton.jit
 def length(x):
-    """Of a vector of one number."""
     return tl.sqrt(x * x)
 
 
@@ -199,13 +190,11 @@ def test_what_cannot_be_traced_is_refused_with_its_line():
 
 @triton.jit
 def quiet(x):
-    """Without derivatives."""
     return x
 
 
 @triton.jit
 def quiet_caller(x):
-    """Calls it."""
     return quiet(x)
 
 

@@ -1,5 +1,3 @@
-"""What a CUDA graph may record, and when a recorded one no longer holds."""
-
 import copy
 
 import pytest
@@ -50,8 +48,6 @@ def test_tensors_of_modules():
 
 
 def test_what_makes_a_recording_invalid():
-    """Not what is in tensors, nor what is private, nor other objects that are made; but all else."""
-
     class Own(UniformGust):
         share = 1.0
 

@@ -1,5 +1,3 @@
-"""The stand-ins for Triton: what kernel files need to be imported and launched where it is not installed."""
-
 import importlib.util
 import os
 import subprocess

@@ -1,5 +1,3 @@
-"""Launches on the device of the tensors, and what can be launched where."""
-
 import importlib.util
 
 import pytest
@@ -49,7 +47,6 @@ def test_the_interpreter_takes_the_blocks_of_a_gpu(monkeypatch):
 
 
 def test_a_cpu_needs_llvmlite(monkeypatch):
-    """As compiled wheels of it are not there for every Python: then torch computes."""
     assert compiles("cpu")
     assert compiles("cuda") == (torch.cuda.is_available() and importlib.util.find_spec("triton") is not None)
     find = importlib.util.find_spec
@@ -62,7 +59,6 @@ def test_a_cpu_needs_llvmlite(monkeypatch):
 
 
 def test_a_function_between_launches_is_recorded_on_a_cpu_only():
-    """CUDA graphs record what it does; here it is called again."""
     calls = []
     with cpu.recording() as made:
         call(lambda: calls.append("cpu"), torch.device("cpu"))

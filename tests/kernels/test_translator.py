@@ -1,5 +1,3 @@
-"""Statements, functions and errors of the translator, in small kernels."""
-
 import inspect
 import re
 
@@ -103,7 +101,6 @@ def _chosen(x, which: tl.constexpr):
 
 @pytest.mark.parametrize(("which", "expected"), [("twice", [2, 4]), (None, [-1, -2]), (1, [101, 102]), (0, [201, 202])])
 def test_a_constant_condition_is_decided(which, expected):
-    """What is not reached need not be possible."""
     out = torch.zeros(2)
     if which is None:
         launch(_constant_branch_of_none, (2,))(torch.tensor([1.0, 2.0]), out, WHICH=None)
@@ -164,7 +161,6 @@ def _loop(out, start, end, step):
 
 @pytest.mark.parametrize("limits", [(0, 5, 1), (2, 9, 3), (3, 3, 1), (5, 2, 1), (-4, 2, 2)], ids=str)
 def test_a_loop_carries_numbers_tuples_and_pointers(limits):
-    """Also one that has no turns."""
     out, turns = torch.zeros(20), list(range(*limits))
     launch(_loop, (1,))(out, *limits)
     expected = torch.zeros(20)
@@ -212,7 +208,6 @@ def _halve(x_in, out):
 
 
 def test_a_loop_until_something_is_found():
-    """With a loop and a branch within it."""
     out = torch.zeros(12)
     launch(_halve, (4,))(torch.tensor([8.0, 1.0, 0.3, 1000.0]), out)
     assert torch.equal(out[:4], torch.tensor([1.0, 1.0, 0.3, 1000 / 64]))
@@ -235,7 +230,6 @@ def _short(out, n, COUNT: tl.constexpr):
 
 
 def test_loops_over_constants():
-    """Those of ``static_range`` of any length, others if they are short."""
     out = torch.zeros(12)
     launch(_short, (1,))(out, 5, COUNT=9)
     assert out.tolist() == [*range(0, 45, 5), 50, 100, 35]
@@ -248,7 +242,6 @@ def _long(out, COUNT: tl.constexpr):
 
 
 def test_long_loops_are_not_unrolled():
-    """Their code does not grow with their length."""
     most = Translator.unrolled
     texts = [str(translate(_long, {"COUNT": n}, {"out": "*f32"}, "f32")) for n in (most, most + 1, 1000)]
     assert [text.count("store float") for text in texts] == [most, 1, 1]
@@ -262,7 +255,6 @@ def test_long_loops_are_not_unrolled():
 
 @triton.jit
 def _pair(x, y=2, SIGN: tl.constexpr = 1):
-    """Two numbers."""
     total: tl.constexpr = SIGN * 10
     return x + y, total
 
@@ -273,7 +265,6 @@ def _twice(x):
 
 
 def test_functions_and_arguments():
-    """Default and named ones, constants, functions and tuples as constants, names of the module."""
     out = torch.zeros(7)
     launch(_given, (1,))(out, 0.5, 4.0, 6, TWICE=_twice, NUMBERS=(1, 2))
     assert out.tolist() == [2.5, 10, 4.5, -10, 4.5, 8, 30]
@@ -465,7 +456,6 @@ def _with(out):
     ids=lambda value: getattr(value, "__name__", ""),
 )
 def test_an_error_names_function_and_line(kernel, message):
-    """The line of the statement, or of the last one within it."""
     start = inspect.getsourcelines(kernel.fn)[1] + 2
     with pytest.raises(TranslationError, match=message) as error:
         launch(kernel, (1,))(torch.zeros(4))

@@ -1,5 +1,3 @@
-"""Triton's hash of itself is computed once for each state of its files."""
-
 import os
 
 import pytest

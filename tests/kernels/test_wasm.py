@@ -1,5 +1,3 @@
-"""Noted launches of a CPU as WebAssembly, in Node.js, and as shaders."""
-
 import subprocess
 from functools import partial
 
@@ -126,7 +124,6 @@ def test_the_first_flag_flies_as_on_the_cpu(in_node, request):
 
 
 def test_tensors_that_share_numbers_still_do(in_node):
-    """Those that no launch uses have a place, too."""
     x = torch.arange(24, dtype=torch.float32)
     half, other = x[12:], torch.full((3,), 7.0)
     image = wasm.image({"nothing": []}, {"x": x, "half": half, "other": other})

@@ -53,7 +53,6 @@ def test_a_tree_looks_at_few_pairs(monkeypatch):
 
 
 def _watch(monkeypatch):
-    """Sizes of the matrices of distances from now on."""
     sizes = []
     cdist = torch.cdist
 

@@ -1,5 +1,3 @@
-"""Structural similarity against torchmetrics."""
-
 import torch
 from shared import rand, value_error
 from torch.testing import assert_close
@@ -14,7 +12,6 @@ def _pictures():
 
 
 def test_ssim_equals_torchmetrics(device):
-    """Which mirrors at the edges: with `valid`, the part of its map that the edges do not reach."""
     x, y = (picture.to(device) for picture in _pictures())
     planes = [picture.movedim(-1, 0)[None] for picture in (x, y)]
     mean, full = structural_similarity_index_measure(*planes, data_range=1.0, return_full_image=True)

@@ -1,5 +1,3 @@
-"""A custom law, from outside the package: examples/materials/custom_law.py, named by its class path in a YAML."""
-
 import importlib
 import sys
 from pathlib import Path

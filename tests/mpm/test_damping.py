@@ -171,7 +171,6 @@ def test_a_cantilever_has_the_damping_ratio_at_two_frequencies(share, beta):
 
 
 def test_each_part_has_its_own_damping():
-    """Two bars far apart that drift: each decays by its own rate; where two meet, a node has the mean of its mass."""
     one, other = (_bar((4, 2, 2), 0.05) for _ in range(2))
     far = replace(other, position=other.position + 2.0, damping=torch.full_like(other.mass, 3.0))
     points = MaterialPoints.join([one, far])

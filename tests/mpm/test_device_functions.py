@@ -92,7 +92,6 @@ def _turned(stretch, generator, device):
 
 
 def _matrices(device, unique=False):
-    """Deformation gradients; with ``unique`` only those with a unique nearest rotation, far from others."""
     generator = torch.Generator().manual_seed(0)
     special = [
         [1.0, 1.0, 1.0], [2.0, 2.0, 1.0], [2.0, 1.0, 1.0], [1.0, 1.0 - 1e-6, 1.0 - 2e-6], [1.5, 0.7, 1e-3],
@@ -162,7 +161,6 @@ FLOWING = PLASTIC | {
 
 
 def _body(law, device):
-    """A body of one law, and the law's row in the table."""
     body = BodyLaws([law])
     return body, torch.tensor(body.table, device=device)
 
@@ -301,8 +299,6 @@ class OwnLaw(NeoHookean):
 
 
 def test_what_a_body_asks_of_a_kernel():
-    """No decomposition if none is needed, and shared parts of laws only once."""
-
     def body(*names):
         return BodyLaws([(ELASTIC | PLASTIC)[name] for name in names])
 

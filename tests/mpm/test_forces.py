@@ -44,7 +44,6 @@ def _setting(formulation="total", batch=(), **options):
 
 
 def _push(state):
-    """A force as a plain function."""
     return 0.2 * torch.ones_like(state.position)
 
 
@@ -86,7 +85,6 @@ def test_a_force_that_is_given_to_a_step_is_added_to_the_others():
 
 @pytest.mark.parametrize("checkpoint", [0, 2])
 def test_gradients_reach_a_force(checkpoint):
-    """Against a difference of two rollouts."""
     solver, start, wind = _setting()
     spring = Spring(3.0, 0.2)
 

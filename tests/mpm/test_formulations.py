@@ -1,5 +1,3 @@
-"""The two formulations against each other, with every law, and what each of them does not support."""
-
 from importlib import import_module
 from pkgutil import iter_modules
 
@@ -16,7 +14,6 @@ FORMULATIONS = ["total", "updated"]
 
 
 def _points(size, spacing, law=None, e=1e4, density=100.0, thickness=None):
-    """Particles in a box of the given size; a side of zero is a single layer."""
     axes = [(torch.arange(max(round(side / spacing), 1)).double() + 0.5) * spacing for side in size]
     position = torch.cartesian_prod(*axes)
     volume = spacing**3 if thickness is None else spacing**2 * thickness
@@ -24,17 +21,14 @@ def _points(size, spacing, law=None, e=1e4, density=100.0, thickness=None):
 
 
 def _bar():
-    """Hung by its top and released: stretches by a few per cent."""
     return _points((0.05, 0.05, 0.7), 0.025, e=3e4), beyond(z=0.6), (0, 0, -9.8)
 
 
 def _cantilever():
-    """Pinned at one end and bent by its weight, three to six cells thick."""
     return _points((0.6, 0.05, 0.1), 0.025, e=1e5), up_to(x=0.1), (0, 0, -9.8)
 
 
 def _sheet():
-    """A pinned sheet under a gentle load across it."""
     points = _points((0.6, 0, 0.4), 0.025, e=1e4, density=30.0, thickness=0.01)
     return points, up_to(x=0.1), (0, 0.3, 0)
 
@@ -92,7 +86,6 @@ def test_what_flows_is_refused_by_total():
 
 
 def _stretched(formulation, points):
-    """After a while in which each part flies apart along x and together along y."""
     solver = MPMSolver(0.1, formulation, gravity=ZERO)
     centre = points.position[:, :1].div(2.0, rounding_mode="floor") * points.position.new_tensor([2.0, 0, 0])
     velocity = 3.0 * (points.position - centre - 0.1) * points.position.new_tensor([1, -1, 0])
@@ -105,7 +98,6 @@ def _stretched(formulation, points):
     ids=FORMULATIONS[::-1],
 )
 def test_several_materials_in_one_run(formulation, laws):
-    """Parts far apart in one run, in a mixed order, move as each does alone, internal variables too."""
     parts = []
     for k, law in enumerate(laws):
         place = _points((0.2, 0.2, 0.2), 0.05).position + 2.0 * double([k, 0, 0])

@@ -1,5 +1,3 @@
-"""Obstacles in the kernels against torch."""
-
 import pytest
 import torch
 from catalogue import OBSTACLES
@@ -42,7 +40,6 @@ def _ask_kernel(obstacle, place, time, device):
 
 @pytest.mark.parametrize("name", OBSTACLES)
 def test_distance_normal_and_velocity(kernel_device, name):
-    """Still and in motion; before, within and after its time, and beyond its last key."""
     frame = SimFrame(double([0.02, 0.0, 0.01]), rotation_from_z([0, -1, 0]).T, 1.2)
     place = (0.9 * torch.rand(40, 3, generator=seeded(0)) - 0.45).to(kernel_device)
     for more in [{}] if name == "still" else [{}, {"path": _path()}]:

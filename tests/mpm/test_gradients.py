@@ -1,5 +1,3 @@
-"""Gradients through whole substeps: every input against finite differences."""
-
 import pytest
 import torch
 from shared import EYE, ZERO, beyond, double, peak, rand, randn, seeded, solid
@@ -53,7 +51,6 @@ def _patches():
 
 
 def _start(values, law, **settings):
-    """The solver, its state at rest and the force of the wind, all from tensors that may require gradients."""
     points = solid(
         values["position"],
         0.09**2 * 0.01,
@@ -110,14 +107,12 @@ def _check(name, law, **settings):
 @pytest.mark.parametrize("setting", SETTINGS)
 @pytest.mark.parametrize("name", INPUTS)
 def test_gradient_of_five_substeps(name, setting, law):
-    """Wind on moving patches, gravity and a pin, by position, F and each input in turn."""
     _check(name, LAWS[law](), **SETTINGS[setting])
 
 
 @pytest.mark.parametrize("setting", SETTINGS)
 @pytest.mark.parametrize("name", ["position", "youngs_modulus", "poisson_ratio"])
 def test_gradient_with_damping_and_two_laws(name, setting):
-    """Through the viscous stress, the decay of velocities and the dispatch of particles to their laws."""
     _check(name, [FixedCorotated(), NeoHookean()], damping=2.0, stiffness_damping=2e-3, **SETTINGS[setting])
 
 
@@ -168,7 +163,6 @@ def test_gradients_are_finite(setting, law, case):
 
 @pytest.mark.parametrize("checkpoint", [0, 7, 30])
 def test_checkpoints_find_what_is_used_late(checkpoint):
-    """A force of two parts, of which the second acts only after the first substeps."""
     points = solid(rand(8, 3), 0.1, 10.0, 1e3)
     first, second = (torch.zeros(3, dtype=torch.float64, requires_grad=True) for _ in range(2))
     solver = MPMSolver(0.5, gravity=ZERO)

@@ -14,7 +14,6 @@ FORMULATIONS = ("total", "updated")
 
 @pytest.fixture(autouse=True)
 def _as_users_run_it(monkeypatch):
-    """Without the value checks that the tests turn on."""
     monkeypatch.setattr(_checks, "VALUE_CHECKS", False)
 
 
@@ -35,7 +34,6 @@ def _broken(*shape, row=7):
 
 
 def _calls(solver, state):
-    """All ways to take a substep."""
     return (solver.step, lambda s, dt: solver.rollout(s, dt, 3), lambda s, dt: solver.watched_rollout(s, dt, 3)), state
 
 
@@ -131,7 +129,6 @@ def test_what_is_given_as_nan_is_named(formulation):
 
 @in_both
 def test_tensors_of_another_kind(formulation):
-    """Device, dtype and length; the force of a function takes the dtype of the state, if it is a real one."""
     solver, state = _solver(formulation)
     for name, shape in (("force", (27, 3)), ("drag", (27,))):
         given = torch.zeros(shape).double()
@@ -189,7 +186,6 @@ def test_the_state_of_another_solver(formulation):
 
 
 def test_a_plate_that_leaves_its_grid():
-    """Its particles then stand still without a word, unless the grid is made for where it flies."""
     plate = _block()
     speed = double([12.0, 0.0, 0.0]).expand(27, 3)
     solver = MPMSolver(DX, "updated", gravity=ZERO)
@@ -214,7 +210,6 @@ def test_a_plate_that_leaves_its_grid():
 
 
 def test_a_plate_that_a_force_drives_out_of_a_fitted_grid():
-    """The grid knows speeds and gravity alone; a margin makes room for the rest."""
     solver, state = _solver("updated")
     push = torch.zeros(27, 3).double()
     push[:, 0] = 2e3 * solver.points.mass

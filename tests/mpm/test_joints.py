@@ -1,5 +1,3 @@
-"""Joints between points: forces of a rigid motion, momenta, closed forms, and how stiff a spring may be."""
-
 import math
 
 import pytest
@@ -16,7 +14,6 @@ AT = double([1.0, 0.1, 0.2])
 
 
 def blocks(flat=False):
-    """Two bodies side by side along x, which meet at a place, and the points of each."""
     side = torch.arange(4).double() / 4
     one = torch.cartesian_prod(side, side, 0 * side if flat else side)
     place = torch.cat([one, one + double([1.05, 0.0, 0.1])])
@@ -27,7 +24,6 @@ def blocks(flat=False):
 
 
 def moved(points, sets, turns, shifts):
-    """The state with each body turned about the joint and shifted."""
     state = MPMSolver(0.5).init_state(points)
     position, F = state.position.clone(), state.F_total.clone()
     for own, turn, shift in zip(sets, turns, shifts, strict=True):
@@ -39,7 +35,6 @@ def moved(points, sets, turns, shifts):
 
 @pytest.mark.parametrize("flat", [False, True])
 def test_springs_act_on_what_parts_and_turns(flat):
-    """A rigid motion of both bodies: the force is that of the gap, the torque that of the turn between them."""
     points, sets = blocks(flat)
     joint = PointJoint(*sets, AT.tolist(), 30.0, 7.0)
     joints = Joints(points, [joint], 1e-6)
@@ -73,7 +68,6 @@ def test_a_joint_to_a_place_and_several_at_once():
 
 
 def test_momenta_stay_and_the_energy_does_not_grow():
-    """Two bodies that fly and spin, joined by a spring that is as stiff as a substep allows."""
     points, sets = blocks()
     longest = float(stable_limit(points, 0.5).min())
     joints = Joints(points, [PointJoint(*sets, AT.tolist(), turning=math.inf)], longest)
@@ -92,7 +86,6 @@ def test_momenta_stay_and_the_energy_does_not_grow():
 
 
 def test_a_spring_is_softened_as_a_substep_needs_it():
-    """Any stiffness is stable, and one that a substep can follow is kept."""
     points, sets = blocks()
     longest = float(stable_limit(points, 0.5).min())
     found = {}

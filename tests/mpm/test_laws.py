@@ -1,5 +1,3 @@
-"""Laws: energy, stress, return maps and bounds on the stiffness of each, and closed forms of single ones."""
-
 import math
 import re
 from functools import partial
@@ -37,7 +35,6 @@ def _gradients(count=50, spread=0.2):
 
 
 def _wide(count=60):
-    """Mild, strong and inverted deformation, away from the jump where two stretches are opposite."""
     F = torch.cat([_gradients(count, spread) for spread in (0.02, 0.25, 0.6)])
     a = torch.linalg.svdvals(F)
     F = F[(a[:, 1] > 1.1 * a[:, 2]) & (a[:, 2] > 0.01)]
@@ -51,13 +48,11 @@ def _rotations(*shape):
 
 
 def _turned(stretches):
-    """Each stretch between rotations of its own."""
     Q = _rotations(2, len(stretches))
     return Q[0] @ double(stretches).diag_embed() @ Q[1]
 
 
 def _internal(law, F, packed=False):
-    """As at rest, or of packed snow."""
     return None if law.internal is None else torch.full_like(F[..., 0, 0], 0.95 if packed else law.internal)
 
 
@@ -69,7 +64,6 @@ def _parts(name, F):
 
 
 def _close(found, exact, tolerance):
-    """To a share of the size of each matrix."""
     assert ((found - exact).norm(dim=(1, 2)) / exact.norm(dim=(1, 2))).max() < tolerance
 
 
@@ -141,7 +135,6 @@ def test_small_strain_is_hookes_law(name):
 
 @STRESSES
 def test_gradients_of_stress(name):
-    """Against differences: at rest, at repeated stretches, rotated, and inverted."""
     F = _turned([[1.0, 1, 1], [0.7, 0.7, 0.7], [1.2, 1.2, 0.8], [1.3, 1.0, 0.6], [1.3, 1.0, -0.6]]).requires_grad_()
     mu, lam = ((x / E).requires_grad_() for x in _lame(len(F)))
     internal = _internal(LAWS[name], F, True)
@@ -153,7 +146,6 @@ def test_gradients_of_stress(name):
 
 @EACH
 def test_all_is_finite_everywhere(name, dtype, device):
-    """Crushed, inverted and singular elements, with their gradients, also after a return map; at rest no stress."""
     stretches = [[1, 1, 1], [0, 0, 0], [1, 1, 0], [1, 1, -1], [1, -1, -1], [3, 2, -5], [1e-3, 1e-3, -1e-3]]
     stretches += [[50, 1, 1e-4], [1.2, 1.1, -0.6], [1, 0.5, -0.5], [0.01, 0.01, 0.01], [3, 2, -60], [1, 0.3, -0.3]]
     F = torch.tensor(stretches, dtype=dtype, device=device).diag_embed().requires_grad_()
@@ -175,7 +167,6 @@ def test_all_is_finite_everywhere(name, dtype, device):
 
 @STRESSES
 def test_inverted_elements_are_pushed_back(name):
-    """A small step along -P lowers the energy and raises the determinant."""
     F = torch.diag(double([1.1, 0.9, -0.4])) @ _rotations(20)
     energy, pk1, _ = _parts(name, F)
     stress = pk1(F)
@@ -317,7 +308,6 @@ def test_volume_correction_returns_what_tension_gained():
 
 
 def test_volume_correction_conserves_the_sum():
-    """log det F + v_c changes only by the deformation; what carries load has lost all that it gained."""
     trial, before = _stretches(), 0.1 * rand(200)
     new, after = _map("sand that swells", trial, before)
     near(new.log().sum(-1) + after, trial.log().sum(-1) + before, TOL)
@@ -395,7 +385,6 @@ def _hessian(law, F, mu, lam):
 @pytest.mark.parametrize("nu", [0.0, 0.3, 0.45])
 @pytest.mark.parametrize("name", ["corotated", "neo-hookean", "hencky", "fluid"])
 def test_moduli_bound_the_hessian(name, nu):
-    """The largest eigenvalue, and the acoustic tensor over many directions; both bounds are tight in mild states."""
     law, mild = LAWS[name], 150
     F = torch.cat([_gradients(mild, 0.05), _gradients(150, 0.3), _gradients(100, 0.8)])
     F = torch.cat([F, torch.linspace(0.2, 3, 20, dtype=torch.float64)[:, None, None] * EYE])
@@ -488,7 +477,6 @@ def test_continued_log():
 
 
 def test_uniaxial_closed_forms():
-    """Stretch along one axis, the others held: each law from its definition."""
     s = 1.3
     F = torch.diag(double([s, 1.0, 1.0]))
     mu, lam, log = float(MU), float(LAM), math.log(s)
@@ -548,7 +536,6 @@ def test_snow_hardens_when_packed():
 
 
 def test_worked_plasticine_weakens_and_worked_metal_hardens():
-    """Yield stress in a uniaxial test at constant volume: sigma_y + H alpha, with alpha the axial plastic strain."""
     trial = torch.diag(double([1.2, 1.2**-0.5, 1.2**-0.5]))[None]
     for name, slope in (("Metal", 300.0), ("Plasticine", -300.0)):
         law = KINDS[name](100.0, 300.0)

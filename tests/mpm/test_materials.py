@@ -1,5 +1,3 @@
-"""Materials by name; tests/tools/test_pages.py compares the table of the docs."""
-
 import math
 
 from shared import value_error

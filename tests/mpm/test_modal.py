@@ -216,7 +216,6 @@ def test_a_bit_that_hangs_by_a_thread_is_left_out(monkeypatch):
 
 
 def test_a_rigid_part_has_six_degrees_of_freedom():
-    """And moves without strain in every mode."""
     head = RigidRegion(beyond(z=0.6))
     points = post()
     soft = Structure(bound(points).bound)

@@ -1,5 +1,3 @@
-"""The `modes` formulation against `total`, exact energies, and what it refuses."""
-
 import math
 
 import pytest
@@ -65,7 +63,6 @@ def run(solver, state, force=None, frames=1, seconds=0.04):
 
 
 def pulled(solver, points, size, frames=0):
-    """The state after a push along x at time zero."""
     velocity = torch.zeros_like(points.position)
     velocity[:, 0] = size * points.position[:, 2] ** 2
     return run(solver, solver.init_state(points, velocity), frames=frames)
@@ -269,7 +266,6 @@ def test_a_run_that_goes_on_is_the_same_to_the_bit(make_simulation, tmp_path):
 
 
 def test_a_change_keeps_the_motion_continuous(make_simulation):
-    """Of the stiffness, the damping and the wind: the next frame goes on from where it is."""
     simulation = swaying(make_simulation)
     state = simulation.start()
     for _ in range(10):
@@ -315,7 +311,6 @@ def test_a_frame_has_from_four_to_sixteen_substeps():
 
 
 def test_any_force_acts():
-    """A function of the state, and a force with a drag, whose work is what the motion loses."""
     points, solver = post(E=1e5), solver_of()
     state = solver.rollout(solver.init_state(points), 0.01, 30, lambda s: torch.full_like(s.position, 0.01))
     assert (state.position - points.position)[-1, :2].gt(0.001).all()
@@ -363,7 +358,6 @@ def test_another_density_keeps_the_place():
 
 
 def test_on_a_pivot_it_sways_as_easily_along_as_across():
-    """A plank five times as wide as thick: pushed both ways, it swings with one frequency, that of the thin way."""
     axes = [(torch.arange(n).double() + 0.5) * 0.05 for n in (2, 10, 20)]
     plank = solid(torch.cartesian_prod(*axes), 0.05**3, 100.0, 1e6)
     pins = [PinnedRegion(up_to(z=0.1), kind="nodes")]
@@ -384,7 +378,6 @@ def test_on_a_pivot_it_sways_as_easily_along_as_across():
 
 
 def test_auto_takes_modes_where_they_will_do_and_says_why(make_simulation):
-    """By the body alone in a solver, and by the lean in the wind in a simulation."""
     held = solver_of("auto")
     held.init_state(post())
     assert (held.formulation, held.why) == ("modes", "it is held, and nothing touches or folds")

@@ -1,5 +1,3 @@
-"""Sheets of one layer that bend by an energy of their own."""
-
 import dataclasses
 
 import pytest
@@ -17,14 +15,12 @@ NU = 0.3
 
 
 def turned(seed):
-    """A rotation; that of zero is none."""
     if seed == 0:
         return EYE
     return polar_rotation(randn(3, 3, generator=seeded(seed)))
 
 
 def sheet(rotation, size=6, per_cell=2.2, bending=0.7, heights=(0.0,), dtype=torch.float64, **more):
-    """A square sheet in cells of side one, its middle near the origin; or several above each other."""
     side = torch.arange(round(size * per_cell)).double() / per_cell - size / 2 + 0.13
     flat = torch.cartesian_prod(side, side, double(heights))
     normal = rotation[:, 2].expand(len(flat), 3).to(dtype)
@@ -69,7 +65,6 @@ def test_a_softened_point_bends_as_much_more_easily():
 
 
 def test_motion_without_curvature_has_no_force():
-    """Rigid motion of any size, and stretch and shear."""
     points = sheet(turned(1))
     solver, _ = bound(points)
     nodes = solver.bound.node_positions(points.position)
@@ -93,7 +88,6 @@ def test_forces_are_those_of_the_energy_and_keep_both_momenta():
 
 
 def test_a_curved_sheet_feels_the_change_of_its_curvature_alone():
-    """A cylinder at rest does not push; flattened by a smooth motion it has the energy of its curvature."""
     radius, per_cell = 20.0, 2.2
     count = round(12 * per_cell)
     angle = (torch.arange(count).double() - count / 2) / per_cell / radius
@@ -115,7 +109,6 @@ def test_a_curved_sheet_feels_the_change_of_its_curvature_alone():
 
 
 def test_sheets_in_one_cell_bend_each_for_itself():
-    """Two parallel ones are as stiff as both, and two that cross have the sum of their energies."""
     generator = seeded(0)
     for other in (sheet(turned(1)), sheet(turned(2))):
         parts = [sheet(turned(1)), other]
@@ -131,7 +124,6 @@ def test_sheets_in_one_cell_bend_each_for_itself():
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_few_rows_make_the_matrix_of_a_cell(seed):
-    """Those of four or five points, three for each; a level sheet has the same shapes in all of them."""
     bending = bound(sheet(turned(seed)))[0].bound.bending
     rows = bending.rows()
     assert_close(rows.mT @ rows, bending.stiffness, rtol=1e-9, atol=1e-12)
@@ -159,7 +151,6 @@ def test_the_largest_frequency_is_found_and_bounds_the_substep(seed):
 
 
 def test_gradients_by_stiffness_and_motion_come_from_torch():
-    """By a modulus, a velocity and the stiffness against bending."""
     points = sheet(turned(1), size=3)
     solver = MPMSolver(1.0, gravity=ZERO)
     leaves = [double(value).requires_grad_() for value in (100.0, 0.0, 1.0)]

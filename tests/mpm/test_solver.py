@@ -1,5 +1,3 @@
-"""Whole steps of both formulations against exact solutions."""
-
 import dataclasses
 
 import pytest
@@ -19,7 +17,6 @@ def _block(*batch, dtype=torch.float64, device="cpu", count=200, e=1e4, density=
 
 @in_both
 def test_free_fall_follows_the_symplectic_sum(formulation, device, dtype):
-    """The same for every particle, and no strain; where the substep changes, gravity acts for the mean of both."""
     points = _block(dtype=dtype, device=device)
     solver = MPMSolver(0.1, formulation)
     state, steps, before, speed, fall = solver.init_state(points), 50, 1e-3, 0.0, 0.0

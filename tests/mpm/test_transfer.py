@@ -1,5 +1,3 @@
-"""Particle-grid transfers against the conservation laws that define APIC."""
-
 import subprocess
 import sys
 
@@ -17,7 +15,6 @@ GRID = GridSpec(DX, (0, 0, 0), (10, 10, 10))
 
 
 def _particles(device, dtype, *batch, count=64):
-    """Random position, mass, velocity and affine velocity, well inside the grid."""
     draw = rand(*batch, count, 16).to(device, dtype)
     return (
         0.2 + 0.6 * draw[..., :3],
@@ -28,7 +25,6 @@ def _particles(device, dtype, *batch, count=64):
 
 
 def p2g(mass, velocity, affine, stencil):
-    """Mass and momentum of the nodes, without impulses."""
     found = scatter_momentum(mass, velocity, affine, None, torch.zeros_like(affine), stencil)
     return found[..., 3], found[..., :3]
 
@@ -132,7 +128,6 @@ def test_what_is_not_finite_or_far_away_indexes_nothing_and_weighs_nothing(devic
 
 
 def test_gradients(device):
-    """Of particles inside, two at one place, and one outside the grid, in a batch of two; of second order, too."""
     position, mass, velocity, affine = _particles(device, torch.float64, 2, count=4)
     position[:, 1] = position[:, 0]
     position[:, 3] = 3.0
@@ -160,7 +155,6 @@ def test_deterministic_runs_have_the_same_bits(formulation, device):
 
 
 def test_scatter_momentum_is_the_sum_that_it_says(device):
-    """Written out with loops: sum over p of w (m (v + C d) + j) - S grad(w)."""
     position, mass, velocity, affine = _particles("cpu", torch.float64, count=6)
     impulse, stress = torch.randn(6, 3).double(), torch.randn(6, 3, 3).double()  # not symmetric, to notice transposes
     given = [t.to(device) for t in (mass, velocity, affine, impulse, stress)]
@@ -186,7 +180,6 @@ def test_scatter_momentum_is_the_sum_that_it_says(device):
 
 
 def test_fixed_order_is_restored_and_does_not_load_the_compiler_of_torch():
-    """``torch.use_deterministic_algorithms`` takes seconds at the start of a run on a GPU: it imports the compiler."""
     code = (
         "import sys, torch\n"
         "from gaussian_swaying.mpm.transfer import in_fixed_order\n"

@@ -1,5 +1,3 @@
-"""Copies of nodes for parts that only lie close to each other."""
-
 import dataclasses
 
 import pytest
@@ -33,7 +31,6 @@ EDGE = up_to(x=1.0)
 
 
 def sheet(height, width=4, length=8):
-    """Two points in a cell of side one, and three layers of them."""
     x, y = (torch.arange(2 * n).double() / 2 + 0.27 for n in (length, width))
     return torch.cartesian_prod(x, y, height + double([-0.05, 0.0, 0.05]))
 
@@ -43,7 +40,6 @@ def material(position, attached=None):
 
 
 def together(*parts):
-    """The points of several parts, and the number of its part for each."""
     return torch.cat(parts), torch.cat([torch.full((len(part),), k) for k, part in enumerate(parts)])
 
 
@@ -77,7 +73,6 @@ def test_one_piece_is_the_same_bit_for_bit(transfer, how):
 @pytest.mark.parametrize("transfer", ["torch", "kernels"])
 @pytest.mark.parametrize("kind", [None, "nodes", "hinge", "clamp"])
 def test_two_sheets_each_move_as_alone(transfer, kind):
-    """With a gap of a fifth of a cell; on shared nodes they differ by far more than the one per cent."""
     parts = sheet(3.1), sheet(3.3)
     pushes = [double([0.0, 0.0, push]).expand_as(parts[0]) for push in (2e-3, -1e-3)]
     position, number = together(*parts)
@@ -99,7 +94,6 @@ def test_two_sheets_each_move_as_alone(transfer, kind):
 
 
 def test_a_place_takes_the_nodes_of_a_point_of_its_cell_that_is_near():
-    """Of one that shares nodes with the point that the place belongs to, and no other copies of them."""
     grid = GridSpec(1.0, (0, 0, 0), (12, 4, 4))
     x = double([1.2, 2.2, 9.2])
     first = first_nodes(torch.stack([x, 0 * x + 1.2, 0 * x + 1.2], -1), grid)
@@ -187,7 +181,6 @@ BOUNDARIES = {
 
 @pytest.mark.parametrize("name", list(BOUNDARIES))
 def test_boundaries_act_on_each_piece(name):
-    """The other sheet is far away for a piece alone, and has the boundaries of its own place."""
     parts = sheet(3.1), sheet(3.3)
     position, number = together(*parts)
     both = rolled(material(position, number), boundaries=[BOUNDARIES[name]()])[2]

@@ -1,5 +1,3 @@
-"""A small flag, and a session of it."""
-
 import asyncio
 import json
 import threading
@@ -36,7 +34,6 @@ def settings(parser, request):
 
 @pytest.fixture
 def session(parser, settings):
-    """A session that is not started yet; it is closed at the end."""
     made = Session(parser, settings)
     yield made
     made.close()
@@ -51,7 +48,6 @@ def in_turn(session):
 
 
 def pause(session):
-    """Pause a session that runs, and wait until the step that was under way is done."""
     session.pause()
     in_turn(session)
 
@@ -78,7 +74,6 @@ class Client:
         self._run(self.socket.send_str(json.dumps({"kind": kind, **fields})))
 
     def get(self, seconds=20.0, confirm=True):
-        """The head of the next message, with its bytes as ``rest``."""
         said = self._run(asyncio.wait_for(self.socket.receive(), seconds))
         if said.type is aiohttp.WSMsgType.TEXT:
             head = json.loads(said.data)
@@ -95,7 +90,6 @@ class Client:
         self.say("ack", count=self._count, rate=30.0)
 
     def wait(self, kind, holds=lambda head: True, seconds=60.0, **wanted):
-        """Take messages in until one of a kind comes, with these values."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             head = self.get()
@@ -122,7 +116,6 @@ class Client:
 
 @pytest.fixture
 def connect():
-    """Connects to a server, and looks from :data:`LOOK`; what is open at the end is closed."""
     opened = []
 
     def connect(server, looks=True, **options):
@@ -138,7 +131,6 @@ def connect():
 
 @pytest.fixture
 def show(parser, settings):
-    """Shows a session, which is that of a small flag unless it is given; both are closed at the end."""
     shown = []
 
     def show(session=None, server=None, **options):
@@ -155,13 +147,11 @@ def show(parser, settings):
 
 @pytest.fixture
 def page(show):
-    """A server with a small flag, and its session, which runs."""
     return show()
 
 
 @pytest.fixture(scope="module")
 def launch(chromium):
-    """Starts browsers with some flags; they are closed at the end."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as driver:
@@ -188,7 +178,6 @@ def shading_browser(launch):
 
 
 def holds(window, condition):
-    """Wait until a condition holds in a window, which may evaluate no text by itself."""
     guarded = f"(() => {{ try {{ return {condition}; }} catch {{ return false; }} }})()"
     until(lambda: window.evaluate(guarded), 90)
 
@@ -199,7 +188,6 @@ PATIENT = "addEventListener('load', () => (wind.patience = 1e12))"
 
 @pytest.fixture
 def open_window(browser, page):
-    """Opens a window with the live page, after some scripts."""
     opened = []
 
     def open_window(width=1100, height=900, scripts=(PATIENT,)):

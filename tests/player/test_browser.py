@@ -1,5 +1,3 @@
-"""The live page draws in a real browser, from the states that it gets."""
-
 import numpy as np
 import pytest
 import torch
@@ -17,7 +15,6 @@ from .conftest import PATIENT, READY, holds, in_turn, pause
 
 @pytest.fixture(scope="module")
 def blank(browser):
-    """A page with the program, and nothing to draw."""
     page = browser.new_page()
     page.add_script_tag(path=PAGE / "film.min.js")
     yield page
@@ -26,7 +23,6 @@ def blank(browser):
 
 @pytest.fixture
 def drawing(open_window):
-    """A window in which the browser draws."""
     window = open_window(640, 480)
     holds(window, READY)
     return window
@@ -54,7 +50,6 @@ PLAY = """([arrivals, until, ended]) => {
     ids=["even", "slow", "irregular"],
 )
 def test_motion_between_states_is_smooth(count, interval, step, jitter, slowest, fastest, blank):
-    """A picture is never ahead, in order, and moves by what passed; then the simulation stalls and ends."""
     rng, last = np.random.default_rng(1), count - 10
     arrivals = [[interval * k + jitter * float(rng.random()), step * k] for k in range(count)]
     arrivals = [[arrival + 2.0 * (k >= last), time] for k, (arrival, time) in enumerate(arrivals)]
@@ -89,7 +84,6 @@ def test_a_step_while_paused_is_shown_soon(blank):
 
 
 def test_after_a_pause_it_goes_on_at_its_speed(blank):
-    """The pause says nothing about how fast the simulation runs."""
     told = blank.evaluate("""() => {
         const playback = new Playback();
         const run = (begin, first, count) => {
@@ -136,7 +130,6 @@ def test_what_was_missed_while_the_window_was_hidden_is_skipped(blank):
 
 
 def test_a_state_with_the_same_time_replaces_the_last(blank):
-    """As after a change of the material while paused."""
     told = blank.evaluate("""() => {
         const playback = new Playback();
         playback.add({ time: 0.04, name: "old" }, 0, true);
@@ -173,7 +166,6 @@ def _drawn(window, page):
 
 
 def test_the_canvas_shows_the_state_as_the_server_draws_it(page, drawing):
-    """Centres from the GPU, and the picture, of a paused flag, from another side than at first."""
     session, window = page.session, drawing
     reached(session, 0.2)
     pause(session)
@@ -200,7 +192,6 @@ def test_the_canvas_shows_the_state_as_the_server_draws_it(page, drawing):
 
 
 def test_pictures_change_between_states_and_never_show_the_future(page, drawing):
-    """The simulation gives few states a second; the time that is shown rises from picture to picture."""
     session, window = page.session, drawing
     session.pace(0.02)
     until(lambda: session.rate() < 0.05)
@@ -324,7 +315,6 @@ def test_a_link_sets_what_it_says(page, browser):
 
 
 def test_the_flag_is_pulled_where_it_is_touched(page, drawing):
-    """And the view turns where it is not."""
     session, window = page.session, drawing
     reached(session, 0.1)
     scene, size = session.simulation.scene, window.viewport_size
@@ -375,7 +365,6 @@ def test_two_browsers_see_the_same_scene_and_closing_one_ends_nothing(page, draw
 
 
 def _is_tinted(now, before):
-    """Whether a pixel got most of the way towards the colour of what is held."""
     return np.abs(now - (0.3 * before + 0.7 * np.array(TINTS["held"]))).max() < 40 < np.abs(now - before).max()
 
 

@@ -1,5 +1,3 @@
-"""One player with three sources: a film, the live page, and a page that simulates."""
-
 import pytest
 import torch
 import yaml
@@ -20,7 +18,6 @@ VIEWS = {"film": "film.view", "live": "wind.view", "page": "windPage.view"}
 
 @pytest.fixture
 def sources(browser, show, parser, tmp_path, monkeypatch):
-    """Windows with a sheet from each source, its simulation, and the session of the live page, which is paused."""
     monkeypatch.setattr(sessions, "SLOW", 1e9)  # a step is a frame, however slow the machine is
     config = tmp_path / "sheet.yaml"
     config.write_text(yaml.safe_dump(CALM | {"recorder": {"video": False, "renders": []}}))

@@ -1,5 +1,3 @@
-"""Parts that are painted on the live page."""
-
 import numpy as np
 import pytest
 import torch
@@ -23,15 +21,12 @@ JOINED, ALIKE = TOGETHER
 
 
 def _move(painting, *path, part="held", key="a", **other):
-    """What a browser tells of its brush."""
     told = {"path": path, "radius": 20.0, "part": part, "first": True, "through": False, "how": None, **LOOK}
     painting.paint(key, told | other)
 
 
 @pytest.fixture
 def start(tmp_path):
-    """Begins to paint in a session, which is at rest then."""
-
     def start(session):
         if not session._thread.is_alive():
             session.start()
@@ -112,7 +107,6 @@ def test_a_stroke_paints_what_is_under_it_and_is_undone_as_a_whole(painting, pla
 
 
 def test_a_double_click_takes_what_hangs_together(painting, places):
-    """And not what its two clicks painted before; beside the object it takes nothing."""
     count = len(places)
     _move(painting, [150, 140], part="still")
     colours = 0.5 + SH_DC * painting.session.simulation.scene.model.sh0[:, 0]
@@ -162,7 +156,6 @@ def test_a_brush_that_cannot_be_is_refused(painting, wrong):
 
 
 def _applied(painting):
-    """Apply the parts, and wait for the simulation that has them."""
     session = painting.session
     before = session.simulation
     painting.apply()
@@ -170,7 +163,6 @@ def _applied(painting):
 
 
 def test_parts_are_applied_with_the_size_that_the_object_has(session, start):
-    """What becomes still does not count for `scene.longest_side`; the change is undone as any other."""
     session.start()
     session.change({"scene.longest_side": 2.4, "scene.metres_per_unit": None})
     until(lambda: session.settings.scene.longest_side == 2.4)
@@ -230,7 +222,6 @@ def test_files_of_parts_stay_while_a_change_can_be_undone(painting, monkeypatch,
 
 
 def test_labels_count_the_gaussians_that_are_not_drawn(parser, settings, start, tmp_path):
-    """With `scene.faint: drop` the file has more than the page draws."""
     cloud = FlagScene(spacing=0.05).generate()
     faint = torch.arange(len(cloud.means)) % 3 == 0
     cloud.opacities[faint] = -4.0
@@ -250,7 +241,6 @@ def test_labels_count_the_gaussians_that_are_not_drawn(parser, settings, start, 
 
 
 def test_a_scene_that_changed_meanwhile_is_painted_from_new(painting):
-    """Strokes are labels of Gaussians that are there no more."""
     session = painting.session
     _move(painting, [200, 150])
     before = session.simulation

@@ -1,5 +1,3 @@
-"""The panel of the live page: what its controls show, and what they change in the session."""
-
 import pytest
 import yaml
 from browsers import until
@@ -37,7 +35,6 @@ def _modulations(panel):
 
 
 def test_every_number_of_the_model_that_a_scene_keeps_has_a_control(panel):
-    """With its unit, and the value that the model has, within the ends of its slider."""
     model, controls = panel.session.simulation.model, panel.names()
     for name in model.numbers():
         known = number(name)
@@ -93,7 +90,6 @@ def test_modulations_are_edited_added_and_removed(panel, monkeypatch):
 
 
 def test_a_known_material_is_taken_but_for_its_thickness(panel):
-    """In motion, and in one change that can be undone."""
     session, rubber = panel.session, MATERIALS["rubber"]
     assert _value(panel, "material") == OWN
     before, thickness = session.simulation, session.settings.material.thickness

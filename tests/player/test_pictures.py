@@ -1,5 +1,3 @@
-"""Pictures from the camera of a browser, picking, and their size."""
-
 import math
 from functools import partial
 
@@ -13,7 +11,6 @@ from gaussian_swaying.simulation.draw import View
 
 
 def told_of(camera, scene):
-    """The message of a browser that looks as a camera does."""
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[:3, :3] = scene.frame.rotation @ camera.world_to_camera[:3, :3].double().mT @ FLIP
     size = scene.size * scene.frame.metres_per_unit
@@ -54,7 +51,6 @@ def test_everything_that_can_be_shown_is_different(session, shown):
 
 
 def test_streaks_of_air_are_those_of_the_render(session):
-    """Over the paler picture."""
     camera_of, camera = _pose(session)
     small = camera_of(192, 108)
     with_air, without = (draw(session.snapshot, small, shown).astype(int) for shown in ("wind", "color"))

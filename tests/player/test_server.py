@@ -31,7 +31,6 @@ from .conftest import LOOK, in_turn, pause
 
 
 def _open(address, data=None, **headers):
-    """Status, headers and content of an answer."""
     try:
         answer = urllib.request.urlopen(urllib.request.Request(address, data, headers=headers), timeout=60)
     except urllib.error.HTTPError as error:
@@ -44,12 +43,10 @@ def _open(address, data=None, **headers):
 
 @pytest.fixture
 def open_page(show):
-    """A page that listens for other computers, too."""
     return show(host="0.0.0.0", names=["Wind.Example"])
 
 
 def test_other_websites_in_the_same_browser_are_refused(page, connect):
-    """Neither by their own name, nor by one that they have pointed at this computer."""
     for headers in ({"Origin": "https://evil.example"}, {"Host": "evil.example"}, {"Host": "[1"}, {"Host": ""}):
         for path in ("/", "/load?name=a.ply"):
             assert _open(page.url + path, b"x" if "load" in path else None, **headers)[0] in (400, 403)
@@ -89,7 +86,6 @@ def test_the_page_is_shown_in_no_frame_and_serves_no_files(page):
     ],
 )
 def test_names_are_on_a_list(name, good):
-    """Of this computer, of `--allow-host`, and the address at which the request arrived."""
     door = Door("0.0.0.0", ["Mine.example"])
     refusal = door.refusal({"Host": name}, [door.token], "192.0.2.7")
     assert (refusal is None) is good
@@ -163,7 +159,6 @@ def test_the_page_starts_the_program(page, zipped):
 
 
 def _nodal(head):
-    """The displacement in the message of a state, as the page reads it."""
     near = np.frombuffer(head["rest"][: 6 * head["nodes"]], "<i2").reshape(-1, 3)
     return of_steps(near, np.frombuffer(head["rest"][6 * head["nodes"] :], "<i4").reshape(-1, 4), head["step"])
 
@@ -203,7 +198,6 @@ def test_the_scene_comes_once_as_a_bundle_and_then_states_that_rise(page, connec
 
 
 def test_who_confirms_nothing_gets_no_more(page, connect):
-    """Nothing piles up; what comes after the answer is new."""
     client = connect(page)
     count = 0
     while count < AHEAD:
@@ -237,7 +231,6 @@ def test_a_browser_that_draws_gets_no_pictures(page, connect):
 
 
 def test_pictures_come_while_a_scene_is_made_once_for_all(page, connect, monkeypatch):
-    """As of millions of Gaussians; and a scene that cannot be made is said on the page."""
     made, begun = threading.Event(), []
 
     def slow(*given):
@@ -272,7 +265,6 @@ def test_who_looks_away_gets_nothing_to_draw(page, connect):
 
 
 def test_changes_come_as_what_they_are(page, connect):
-    """Light alone; another motion after a reset; the end of a pause; another scene."""
     client, session = connect(page), page.session
     first = client.wait("state")
     session.change({"background": [0.0, 0.0, 1.0]})
@@ -296,7 +288,6 @@ def test_changes_come_as_what_they_are(page, connect):
 
 
 def test_only_colours_that_changed_are_sent(page, connect):
-    """Tints of roles on the colours of the film, in its order; without roles all have their own colours again."""
     client, session = connect(page), page.session
     pause(session)
     client.wait("state", ended=True)
@@ -332,7 +323,6 @@ def test_what_a_browser_cannot_draw_is_drawn_here(session):
 
 
 def test_a_gpu_is_read_in_turn(session, monkeypatch):
-    """Another thread may record a graph; on a CPU nobody waits."""
     snapshot, taken = session.snapshot, []
     monkeypatch.setattr(type(snapshot.simulation.turn), "__enter__", lambda turn: taken.append(turn))
     monkeypatch.setattr(type(snapshot.simulation.turn), "__exit__", lambda turn, *error: None)
@@ -374,7 +364,6 @@ def test_a_client_that_reads_nothing_slows_nobody(page, connect):
 
 @pytest.mark.slow
 def test_thirty_browsers_get_states_and_a_change_shows_soon(page, connect):
-    """All of the same motion; the simulation goes on."""
     clients = [connect(page) for _ in range(30)]
     for client in clients:
         client.wait("state")
@@ -403,7 +392,6 @@ def test_controls_change_the_session_for_all(page, connect):
 
 
 def test_a_pull_is_answered_with_its_place(page, connect):
-    """From the eye along a ray, in metres; beside the object nothing is held."""
     client, session = connect(page), page.session
     pause(session)
     scene = session.simulation.scene
@@ -529,7 +517,6 @@ def test_a_file_that_is_no_splat_or_too_large_is_refused(page, monkeypatch):
 
 
 def test_a_bar_shows_how_far_a_scene_is_loaded(show, connect):
-    """From the start, before there is a session; then it goes away."""
     server = Server(port=8480, largest=320)
     client = connect(server)
     assert client.wait("figures")["loading"]["what"] == "Loading the scene"

@@ -1,5 +1,3 @@
-"""A simulation that goes on in a thread, and is changed there."""
-
 import dataclasses
 import math
 import threading
@@ -40,7 +38,6 @@ def test_it_goes_on_pauses_and_steps(session):
 
 
 def test_gaussians_much_smaller_than_a_pixel_are_thinned(session):
-    """On a CPU, in the first simulation and in one made anew; a run draws all of them."""
     before = session.simulation
     session._change({"solver.dx": 0.3})
     assert session.simulation is not before
@@ -76,7 +73,6 @@ def test_it_does_the_same_as_a_loop_over_frames(parser, settings, session, monke
     ],
 )
 def test_what_changes_in_motion(session, values, found):
-    """The simulation stays the same object, and the state goes on."""
     session.start()
     reached(session, 0.05)
     simulation, time_before = session.simulation, session.snapshot.health.time
@@ -161,7 +157,6 @@ def _stiffness(session):
 
 
 def test_restore_brings_pins_and_material_back(session):
-    """All that was changed, and the motion starts at rest; that can be undone, too."""
     first, rest, stiffness = session.yaml(), _position(session).clone(), _stiffness(session)
     session.start()
     session.change({"solver.boundaries": []})
@@ -227,7 +222,6 @@ def test_undo_heals_what_diverged_and_forgets_what_was_refused(session):
 
 
 def test_material_of_parts_is_that_of_a_run(parser, settings, tmp_path):
-    """Edits act at their time, and another stiffness leaves them what they are."""
     file = tmp_path / "edited.yaml"
     edit = {"time": 0.06, "E": 5e4}
     file.write_text(yaml.safe_dump(yaml.safe_load(config_text(parser, settings)) | {"edits": [edit]}))
@@ -271,7 +265,6 @@ def test_a_pull_moves_what_it_holds_and_lets_go(session):
 
 @pytest.mark.parametrize(("speed", "step", "expected"), [(0.2, 0.03, 0.2), (1.0, 0.03, 1.0), (1.0, 0.08, 0.5)])
 def test_slow_motion_is_slower(session, monkeypatch, speed, step, expected):
-    """On a clock of its own, which a step moves on by ``step`` seconds, and a wait by what it was asked to be."""
     now = [0.0]
 
     def takes_time(state):
@@ -302,7 +295,6 @@ def test_steps_get_shorter_where_they_take_long(parser, settings, monkeypatch):
 
 
 def test_steps_of_few_substeps_stay_as_long(session, settings, monkeypatch):
-    """As those of modes, which take as long for a shorter step."""
     monkeypatch.setattr("gaussian_swaying.player.session.SLOW", 0.0)
     monkeypatch.setattr("gaussian_swaying.player.session.FEW", 10**6)
     session._advance(single=True)
@@ -311,7 +303,6 @@ def test_steps_of_few_substeps_stay_as_long(session, settings, monkeypatch):
 
 @pytest.mark.gpu
 def test_on_a_gpu_it_is_changed_and_drawn_at_the_same_time(parser, settings):
-    """Graphs are recorded and replayed in the thread of the session while others draw."""
     settings.device = "cuda"
     session = Session(parser, settings).start()
     camera = session.simulation.painter.camera_at(0)
@@ -355,7 +346,6 @@ def test_on_a_gpu_it_is_changed_and_drawn_at_the_same_time(parser, settings):
 
 
 def test_computed_air_keeps_the_length_of_its_frames(parser, request, monkeypatch):
-    """Where steps take long they stay as long, another wind blows in at once, and another length starts anew."""
     monkeypatch.setattr("gaussian_swaying.player.session.SLOW", 0.0)
     config = request.config.rootpath / "configs/sim/flag_in_air.yaml"
     small = [f"--config={config}", "--scene.generator.init_args.spacing=0.05", "--solver.dx=0.1", "--air.cells=24"]

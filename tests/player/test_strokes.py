@@ -1,5 +1,3 @@
-"""Labels that are painted, and go back."""
-
 import torch
 
 from gaussian_swaying.gaussians.parts import ROLES, Part, Parts
@@ -60,7 +58,6 @@ def test_a_stroke_that_changes_nothing_is_none():
 
 
 def test_roles_follow_the_labels_and_are_another_tensor_each_time():
-    """What was sent before is compared with what is there now."""
     strokes = _painted()
     before = strokes.roles
     strokes.paint(STILL, torch.tensor([4]))

@@ -1,5 +1,3 @@
-"""What whole steps of a free body conserve: momenta, affine motion, and the same answer wherever it lies."""
-
 import dataclasses
 
 import pytest
@@ -30,7 +28,6 @@ def _affine(settings, points, rate, velocity=(0.2, 0.2, 0.2)):
 
 
 def _drift(solver, state, steps, tamper=lambda state: state):
-    """Relative change of the linear and of the angular momentum."""
     before, largest = solver.momenta(state), 0.0
     with torch.inference_mode():
         for _ in range(steps):
@@ -58,7 +55,6 @@ def test_without_the_affine_velocity_angular_momentum_is_lost():
 
 @EACH
 def test_affine_velocity_is_reproduced(settings):
-    """The first step has no stress: velocities and their gradient come back as they were, and F is I + dt A."""
     points = _scattered()
     solver, state = _affine(settings, points, RATE)
     end = solver.step(state, 1e-3)
@@ -72,7 +68,6 @@ def test_affine_velocity_is_reproduced(settings):
 
 
 def _elsewhere(settings, shift, rate, steps):
-    """Displacements of a body moved by a number of cells, and how far its size changed."""
     points = block(DX, (0, 0, 0), (3, 3, 3), settings, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3)
     moved = dataclasses.replace(points, position=points.position + DX * double(shift))
     solver, state = _affine(settings, moved, rate)

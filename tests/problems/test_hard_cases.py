@@ -91,7 +91,6 @@ def _simulation(points, boundaries=(), wind=None, aero=None, dx=0.1, frame_dt=0.
 
 
 def _flag(wind, formulation, material=None, aero=None, width=0.8, spacing=0.1, dx=0.2, frame_dt=0.04, **solver):
-    """A flag on its pole, without gravity unless given."""
     source = FlagScene(width=width, height=0.4, spacing=spacing)
     pole = PinnedRegion(up_to(x=1.1 * spacing))
     solver = {"gravity": (0.0, 0.0, 0.0), "boundaries": [pole], "cfl": CFL, "transfer": TRANSFER, **solver}
@@ -103,7 +102,6 @@ def _flag(wind, formulation, material=None, aero=None, width=0.8, spacing=0.1, d
 
 
 def _throw(simulation, velocity):
-    """The state at rest with a velocity."""
     simulation.start()
     scene = simulation.scene
     velocity = torch.as_tensor(velocity, dtype=scene.points.position.dtype).expand_as(scene.points.position)
@@ -181,21 +179,18 @@ def _margin(log):
 
 
 def _assert_no_gain(log, since=0, beyond=0.0):
-    """At no frame there is more energy than at any earlier one, but for what the wind gave (and `beyond`)."""
     excess = _excess(log)[since:]
     lowest = itertools.accumulate(excess, min)
     assert max(now - least for now, least in zip(excess, lowest, strict=True)) <= _margin(log) + beyond
 
 
 def _assert_balanced(simulation, log):
-    """The energy is that of the start and the work of the wind; `updated` may lose some in its transfers."""
     _assert_no_gain(log)
     if simulation.solver.neighbours_fixed:
         assert min(_excess(log)) >= -_margin(log)
 
 
 def _assert_conserved(simulation, log):
-    """The energy and momentum of the start."""
     _assert_balanced(simulation, log)
     mass, start = float(simulation.solver.points.mass.sum()), _energy(log[0])
     for name in ("momentum_x", "momentum_y", "momentum_z"):
@@ -247,7 +242,6 @@ def test_contrasts_within_one_body(case, formulation):
 @pytest.mark.slow(gate=["NeoHookean"])
 @pytest.mark.parametrize("law", ["FixedCorotated", "NeoHookean", "StVKHencky"])
 def test_an_inverted_body_turns_back(law):
-    """`total`, a block mirrored onto itself and shaken: all det F are positive in the end, the energy never grows."""
     position = _lattice(3, 3, 3)
     simulation = _simulation(_points(position, law=KINDS[law]()), formulation="total", damping=20.0, frame_dt=2e-3)
     state = simulation.start()
@@ -327,7 +321,6 @@ LAWS = {
     [(name, f) for name in LAWS for f in FORMULATIONS if f == "updated" or "elastic" in name or "Hookean" in name],
 )
 def test_a_body_thrown_on_a_plane_at_50_metres_per_second(law, formulation):
-    """It is stopped within the support of the nodes behind the plane, gains no energy and bounces no faster."""
     kind, given, stiffness = LAWS[law]
     position = _lattice(3, 3, 3, low=(0, 0, 0.05))
     points = _points(position, law=KINDS[kind](*given), youngs_modulus=stiffness)
@@ -348,7 +341,6 @@ def test_a_body_thrown_on_a_plane_at_50_metres_per_second(law, formulation):
 @in_both
 @pytest.mark.parametrize("cells", [0.25, 0.5, 1.0, 2.0, 4.0])
 def test_a_sheet_of_one_layer_and_some_cells_thick(cells, formulation):
-    """Thickness changes mass and stiffness alike: the flag gains what the wind works, in `updated` at most that."""
     material = Material(E=1e4, density=40.0, thickness=0.2 * cells)
     simulation = _flag(WindField([6.0, 3.0, 0.0]), formulation, material)
     _, log = _advance(simulation, 5)
@@ -367,7 +359,6 @@ def test_a_sheet_coarser_than_its_grid_is_reported():
 @in_both
 @pytest.mark.parametrize("side", [0.08, 1e-3, 1e-6])
 def test_a_body_within_one_cell(side, formulation):
-    """Thinner than a cell every way: it flies and turns as any body does, and conserves its momentum."""
     position = _lattice(2, 2, 2, spacing=side / 2, low=(0.21, 0.21, 0.21))
     points = _points(position, volume=1e-6)
     simulation = _simulation(points, formulation=formulation)
@@ -467,7 +458,6 @@ def test_a_schedule_that_is_no_number_is_refused():
 @pytest.mark.parametrize("drag_step", ["semi_implicit", "explicit"])
 @pytest.mark.parametrize("factor", [math.nan, math.inf, 1e30])
 def test_a_modulation_that_breaks_the_wind_is_a_divergence(formulation, drag_step, factor, monkeypatch):
-    """The message says that something is NaN or infinite or takes too many substeps, and sends to the wind."""
     monkeypatch.setattr("gaussian_swaying.mpm.formulation.MAX_NODES", 100_000)
     wind = WindField([1.0, 0.0, 0.0], modulations=[_Broken(factor)])
     points = _points(_lattice(3, 3, 1))
@@ -517,7 +507,6 @@ def test_a_sheet_twisted_by_720_degrees(formulation):
 @in_both
 @pytest.mark.parametrize("law", ["FixedCorotated", "NeoHookean", "StVKHencky"])
 def test_a_block_crushed_to_a_tenth_and_let_go(law, formulation):
-    """Between two handles: after the release its energy only falls, and once it is calm it has its shape again."""
     position = _lattice(3, 3, 6)
     fast = 0.9 * 0.3 / 2 / 0.1
     grips = [
@@ -618,7 +607,6 @@ def test_many_steps_of_nothing(formulation, steps):
 
 @in_both
 def test_a_fixed_substep_that_becomes_too_long_is_refused(formulation):
-    """When the material stiffens on the way, with a divergence that names it."""
     points = _points(_lattice(3, 3, 3), law=KINDS["NeoHookean"]())
     simulation = _simulation(points, formulation=formulation, substep=2.5e-3)
     state = simulation.start()
@@ -786,7 +774,6 @@ def test_ten_minutes_of_a_gusty_flag(damping):
 @pytest.mark.slow
 @pytest.mark.skipif(TRANSFER == "torch", reason="this is that run")
 def test_the_hard_cases_hold_in_torch():
-    """All that are in the gate, once more without kernels."""
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", __file__]
     given = {**os.environ, "GAUSSIAN_SWAYING_HARD_CASES": "torch"}
     made = subprocess.run(

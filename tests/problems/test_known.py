@@ -28,7 +28,6 @@ def test_a_known_answer_on_a_coarse_grid(one, run):
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize(("one", "run", "recorded"), FINE, ids=[_name(one, run) for one, run, _ in FINE])
 def test_a_known_answer_on_a_fine_grid(one, run, recorded):
-    """What the record reached is reached, and what it missed is missed by no more than a tenth more."""
     found = one.verdicts(run | one.measure(**run), one.goal)
     before = one.verdicts(run | vars(recorded), one.goal)
 

@@ -1,5 +1,3 @@
-"""The references of known answers, beside numbers that were computed by other means."""
-
 import math
 
 import pytest
@@ -24,7 +22,6 @@ pytestmark = pytest.mark.slow
 
 
 def test_elasticas():
-    """Under its weight (drop, shortening, slope in degrees), and in a flow (drag)."""
     for b, *known in [(0.5, 0.0623, 0.0022, 4.76), (4, 0.4252, 0.1099, 33.72), (32, 0.8785, 0.6715, 83.73)]:
         drop, shortening, slope = elastica(b)
         assert [drop, shortening, math.degrees(slope)] == pytest.approx(known, abs=5e-3)

@@ -1,5 +1,3 @@
-"""Solver and wind law together, against closed forms."""
-
 import math
 
 import pytest
@@ -14,7 +12,6 @@ SIDE, SPACING, THICKNESS, DENSITY, AIR, C = 0.4, 0.05, 0.01, 20.0, 1.225, 1.2
 
 
 def _fly(formulation, law, wind, seconds):
-    """Mean velocity of a stiff square plate in the x-z plane after some time in wind along y, its normal."""
     axis = (torch.arange(round(SIDE / SPACING)).double() + 0.5) * SPACING
     points = solid(torch.cartesian_prod(axis, torch.zeros(1).double(), axis), SPACING**2 * THICKNESS, DENSITY)
     solver = MPMSolver(0.1, formulation, gravity=ZERO)

@@ -68,7 +68,6 @@ def test_a_checkpoint_executes_no_code(tmp_path, bare):
 
 
 def test_a_splat_that_was_exchanged(make_cloud, tmp_path):
-    """As many Gaussians under the same name, one of them elsewhere; and other Gaussians in place of the file's."""
     file, folder, cloud = tmp_path / "splat.ply", tmp_path / "run", make_cloud()
 
     def go(frames, resume, given=None):

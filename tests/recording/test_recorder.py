@@ -94,7 +94,6 @@ def test_files_of_a_run(make_simulation, tmp_path):
 
 
 def test_diagnostics_are_a_table_too(make_simulation, tmp_path):
-    """One row per frame with the numbers of summary.json, readable by any spreadsheet."""
     summary = _run(make_simulation(), tmp_path / "run")
     table = rows(tmp_path / "run" / "diagnostics.csv")
     assert len(table) == len(summary["per_frame"]) == 3
@@ -234,7 +233,6 @@ def _not_again(monkeypatch):
 
 
 def _before_png(monkeypatch, action):
-    """Do something in the thread that writes a PNG, given its frame number."""
     write = recorder_module.save_png
 
     def wrapped(path, *arguments, **settings):
@@ -270,7 +268,6 @@ def test_the_video_is_in_order_though_the_pngs_are_not(tmp_path, monkeypatch):
 
 
 def test_what_is_changed_after_the_call_is_written_as_it_was(tmp_path, monkeypatch):
-    """The checkpoint after what it promises, however slow that is."""
     gate, save = threading.Event(), torch.save
     _before_png(monkeypatch, lambda _: gate.wait(LONG))
 
@@ -304,7 +301,6 @@ def test_what_is_changed_after_the_call_is_written_as_it_was(tmp_path, monkeypat
 
 @pytest.mark.parametrize("frame", [2, 3])
 def test_a_run_whose_disk_is_full_can_be_resumed(frame, make_simulation, tmp_path, monkeypatch):
-    """Also if the last frame is the one that cannot be written, and that shows only after the simulation."""
     fail = threading.Event()
 
     def disk_full(k):
@@ -331,7 +327,6 @@ def test_a_run_whose_disk_is_full_can_be_resumed(frame, make_simulation, tmp_pat
 
 
 def test_ffmpeg_that_breaks_off_costs_no_frame(tmp_path, monkeypatch):
-    """The video is made of the PNGs then."""
     write, calls = VideoEncoder.write, []
 
     def breaks_off(self, image):
@@ -557,7 +552,6 @@ def test_what_cannot_close(make_simulation, tmp_path):
 
 
 def test_slow_motion_and_loops_of_the_command_line():
-    """A film of as many frames of the same speed, from finer steps of time, and more frames before one that closes."""
     parser = Simulation.parser()
     plain = parser.parse_args(["--frames=51", "--frame_dt=0.04"])
     found = applied(parser.parse_args(["--frames=51", "--frame_dt=0.04", "--slow=4", "--loop=2"]))

@@ -14,7 +14,6 @@ FRAMES = 3
 
 @pytest.fixture
 def run(make_simulation, tmp_path):
-    """A complete run of three frames, and how to go on to a fourth."""
     simulation, folder = make_simulation(), tmp_path / "run"
     recorder = Recorder(renders=["color", "depth"])
     simulation.run(folder, FRAMES, progress=False, recorder=recorder)
@@ -22,7 +21,6 @@ def run(make_simulation, tmp_path):
 
 
 def test_missing_files_are_told(run, capsys):
-    """The run goes on without them: they may have been removed on purpose."""
     folder, resume = run
     for name in ("frames/00000.png", "frames/00001.png", "depth_raw/00001.png", "trajectory.npz"):
         (folder / name).unlink()

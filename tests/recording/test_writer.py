@@ -178,7 +178,6 @@ def test_a_copy_is_what_was_there():
 
 @pytest.mark.gpu
 def test_a_copy_from_a_gpu_makes_nobody_wait():
-    """Not the host, and not the stream, in which the value is changed while the copy is under way."""
     value = {"F": torch.rand(1_000_000, 9, device="cuda"), "half": torch.rand(100, device="cuda").half()}
     expected = {name: tensor.cpu() for name, tensor in value.items()}
     with without_waits():

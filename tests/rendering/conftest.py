@@ -1,5 +1,3 @@
-"""Shared by the tests of cameras."""
-
 import pytest
 import torch
 
@@ -7,7 +5,6 @@ from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
 
 
 def oblique(width, height, away, dtype=torch.float64):
-    """A camera with its principal point off the centre, and pixels that are not square."""
     camera = look_at_camera((0.1, -away, 0.2), (0, 0, 0), (0, 0, 1), 50.0, width, height, 0.2, dtype=dtype)
     intrinsics = camera.intrinsics.clone()
     intrinsics[0, 2] += 1.3

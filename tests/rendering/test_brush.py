@@ -1,5 +1,3 @@
-"""The Gaussians that a brush touches, against plain loops over all of them."""
-
 import itertools
 import math
 
@@ -32,7 +30,6 @@ def _sheet(y, count=24):
 
 
 def _distance(x, y, path):
-    """From a point to a path, with plain numbers."""
     ends = [*itertools.pairwise(path)] or [(path[0], path[0])]
     found = []
     for (ax, ay), (bx, by) in ends:
@@ -43,7 +40,6 @@ def _distance(x, y, path):
 
 
 def _slope(depth, row, column):
-    """How much a depth changes from a pixel to the next, with plain numbers; infinite where nothing is drawn."""
     total = 0.0
     for down, right in ((1, 0), (0, 1)):
         steps = []
@@ -104,7 +100,6 @@ def test_a_brush_does_not_reach_through_the_object():
 
 
 def test_a_surface_is_all_in_front_seen_at_a_slant():
-    """A sheet whose depth changes much from pixel to pixel."""
     view = _view(_sheet(0.0, 40), camera=_camera(eye=(2.7, -1.2, 0.0)))
     assert view.inside.all()
     assert view.front.all()
@@ -123,7 +118,6 @@ def test_a_slack_adds_layers_just_behind():
 
 
 def test_a_flat_gaussian_has_its_extent_along_the_line_of_sight():
-    """The second one is hidden if it is flat, and not if it reaches to the first."""
     means = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.5, 0.0]])
     picture = RenderOutput(torch.zeros(9, 9, 3), torch.ones(9, 9, 1), torch.full((9, 9, 1), 3.0))
     for depth, front in ((0.01, [True, False]), (0.3, [True, True])):

@@ -1,5 +1,3 @@
-"""Cameras against hand-computed geometry."""
-
 import dataclasses
 import math
 

@@ -1,5 +1,3 @@
-"""The camera of each frame of a run."""
-
 import json
 import math
 
@@ -79,7 +77,6 @@ def test_bad_look_at_and_capture_arguments():
 
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
 def test_the_near_plane_has_the_size_of_the_scene(unit, tmp_path):
-    """A hundredth of the distance to the target, or of the object where a pose has no target."""
     centre, up = torch.full((3,), 2.0 * unit), torch.tensor([0.0, 0.0, 1.0])
     data = {"w": 8, "h": 8, "camera_angle_x": 1.0, "frames": [{"transform_matrix": torch.eye(4).tolist()}]}
     file = tmp_path / "transforms.json"

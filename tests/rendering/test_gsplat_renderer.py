@@ -1,5 +1,3 @@
-"""The gsplat renderer against the torch renderer."""
-
 import math
 import sys
 import threading
@@ -127,7 +125,6 @@ def test_missing_cuda_is_named():
 
 @pytest.mark.gpu
 def test_a_splat_as_it_is_stored_matches_the_torch_renderer():
-    """Picture, and the gradients that training and densification use."""
     generator = seeded(1)
     count = 500
     means = (torch.rand(count, 3, generator=generator) - 0.5) * torch.tensor([3.0, 8.0, 2.0])
@@ -158,7 +155,6 @@ def test_a_splat_as_it_is_stored_matches_the_torch_renderer():
 
 
 def test_one_process_compiles_the_kernels_of_gsplat_at_a_time(tmp_path, monkeypatch, capsys):
-    """The others say that they wait; afterwards the kernels are loaded once."""
     monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path))
     backend = types.ModuleType("gsplat.cuda._backend")
     backend._C = object()
@@ -194,7 +190,6 @@ def test_the_folder_of_the_kernels_is_that_of_torch(tmp_path, monkeypatch):
 
 
 def test_kernels_that_were_loaded_before_are_loaded_by_their_file(tmp_path, monkeypatch):
-    """Any compiled module stands for them; with another torch or another option gsplat itself is asked again."""
     monkeypatch.setenv("TORCH_EXTENSIONS_DIR", str(tmp_path))
     library = tmp_path / "gsplat_cuda" / "gsplat_cuda.so"
     library.parent.mkdir()
@@ -229,7 +224,6 @@ def test_kernels_that_were_loaded_before_are_loaded_by_their_file(tmp_path, monk
 @pytest.mark.gpu
 @pytest.mark.parametrize("degree", [0, 2])
 def test_put_together_it_is_the_picture_of_gsplat_s_rasterization(degree):
-    """Colours, alphas and gradients; the sums of the kernels' atomics are in no fixed order."""
     from gsplat import rasterization
 
     generator = seeded(3)

@@ -1,5 +1,3 @@
-"""Camera paths given by keys."""
-
 import math
 from itertools import pairwise
 
@@ -24,7 +22,6 @@ def test_keys_are_met_and_held_beyond():
 
 
 def test_smooth_values_stay_between_their_keys_and_have_no_kink():
-    """Monotone between keys; the rate just before and after every key is the same, zero at the ends."""
     for k in range(3):
         for d in range(2):
             low, high = sorted((ROWS[k][d], ROWS[k + 1][d]))

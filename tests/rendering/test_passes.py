@@ -1,5 +1,3 @@
-"""Depth, normals and scalars as numbers and colours."""
-
 import math
 
 import pytest

@@ -1,5 +1,3 @@
-"""Normals, plane distances and depths of a rendered surface."""
-
 import math
 
 import pytest
@@ -20,7 +18,6 @@ def _camera(width=40, height=30):
 
 
 def _plane(count=2500, half=0.9):
-    """Discs on a tilted plane, each turned about its normal at random."""
     generator = seeded(0)
     flat = rand(count, 2, generator=generator) * 2 * half - half
     frame = rotation_from_z(NORMAL)
@@ -50,7 +47,6 @@ def _true_depth(camera):
 
 
 def test_discs_of_a_plane_show_that_plane():
-    """Its depth at every pixel, not that of the centres, which differ from it within each disc."""
     camera = _camera()
     maps, _ = _maps(camera, *_plane())
     known = maps.known[..., 0]

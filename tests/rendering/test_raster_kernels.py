@@ -31,7 +31,6 @@ def _scene(count=300, seed=3, size=0.08):
 
 
 def _agree(scene, camera, background=BACKGROUND, eps2d=0.3):
-    """Compare with the definition, where a threshold may fall on either side of a number close to it."""
     made = raster.render(*scene, camera, background, eps2d)
     double = [part.double() for part in scene]
     pictures = []
@@ -53,7 +52,6 @@ def _agree(scene, camera, background=BACKGROUND, eps2d=0.3):
 
 @pytest.mark.parametrize("size", [(61, 43), (64, 48), (8, 16), (1, 1), (7, 90), (130, 5)])
 def test_random_gaussians(size):
-    """Pictures that are and are not a multiple of a tile."""
     made = _agree(_scene(), _camera(*size))
     assert size == (1, 1) or float(made.alpha.max()) > 0.5
 
@@ -64,7 +62,6 @@ def test_small_gaussians(seed):
 
 
 def test_pixels_end():
-    """Opaque Gaussians before others, in the tile as a whole and in some of its pixels."""
     means, covariances, opacities, colors = _scene(600, size=0.3)
     opacities = opacities * 0.1 + 0.9
     made = _agree((means, covariances, opacities, colors), _camera())
@@ -84,7 +81,6 @@ def test_thin_and_huge_gaussians():
 
 
 def test_gaussians_that_are_not_drawn():
-    """Behind the camera, before the near plane, too faint, beside the picture, not finite."""
     scene = _scene()
     expected = _agree(scene, _camera())
     extra = [part[:9].clone() for part in _scene(seed=4)]
@@ -110,7 +106,6 @@ def test_empty_pictures(case):
 
 
 def test_near_and_far_gaussians_in_order():
-    """Of two opaque Gaussians at one place the nearer is seen, and of equal ones the first."""
     camera = Camera(torch.eye(4), torch.tensor([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), 16, 16)
     means = torch.tensor([[0.0, 0, 3.0], [0, 0, 2.0], [0, 0, 2.0], [0, 0, 2.0000002]])
     colors = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
@@ -149,7 +144,6 @@ def test_the_same_bits_for_any_number_of_threads():
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """Counts the pictures that the kernels draw."""
     calls, render = [], raster.render
 
     def counted(*given):

@@ -1,5 +1,3 @@
-"""Shading against closed-form values."""
-
 import math
 from functools import partial
 

@@ -1,5 +1,3 @@
-"""Thinned Gaussians look like all of them; what is large enough is drawn as it is."""
-
 import math
 
 import pytest
@@ -22,7 +20,6 @@ def _camera(dtype=torch.float32):
 
 
 def _cloud(count, pixels, opacity=0.6, seed=0, dtype=torch.float32):
-    """A ball of Gaussians of a size in pixels, with a colour that changes across it."""
     draw = seeded(seed)
     means = torch.randn(count, 3, generator=draw, dtype=dtype) * 0.3
     focal = float(_camera().intrinsics[0, 0])
@@ -39,7 +36,6 @@ def _psnr(one, other):
 
 @pytest.mark.parametrize(("pixels", "least"), [(0.05, 19), (0.1, 24), (0.2, 31)])
 def test_thinned_gaussians_look_like_all_of_them(pixels, least):
-    """The share that the size asks for; nearer to the whole picture than the same ones as they were."""
     given, camera = _cloud(40_000, pixels, opacity=0.05), _camera()
     some = thinned(*given, camera, 1 / 3)
     assert len(some[0]) / len(given[0]) == pytest.approx(max((3 * pixels) ** 2, FEWEST), rel=0.1)
@@ -67,7 +63,6 @@ def test_one_covers_for_those_that_are_left_out():
 
 
 def test_large_gaussians_are_drawn_as_they_are():
-    """Nothing is said about what is not finite."""
     given = _cloud(500, 2.0)
     assert all(one is other for one, other in zip(thinned(*given, _camera()), given, strict=True))
     small = _cloud(500, 0.05)

@@ -1,5 +1,3 @@
-"""The colours of roles."""
-
 import torch
 
 from gaussian_swaying.gaussians.parts import ROLES
@@ -7,7 +5,6 @@ from gaussian_swaying.rendering.tints import TINTS, by_role, greyed, tinted
 
 
 def test_roles_are_told_apart_by_their_colours():
-    """Soft keeps its own, still is grey, and the others have a tint."""
     own = torch.tensor([0.2, 0.6, 0.1])
     shown = dict(zip(ROLES, by_role(own.expand(len(ROLES), 3), torch.arange(len(ROLES))), strict=True))
     assert torch.equal(shown["soft"], own)

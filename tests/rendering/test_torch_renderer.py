@@ -1,5 +1,3 @@
-"""The torch renderer against a loop over pixels and Gaussians written from the equations."""
-
 import math
 
 import pytest
@@ -23,7 +21,6 @@ def _camera():
 
 
 def _scene(count=40, dtype=torch.float64, device="cpu"):
-    """Overlapping, opaque, faint, thin and diagonal, partly off-screen and near-plane Gaussians."""
     generator = seeded(3)
     means = (rand(count, 3, generator=generator) - 0.5) * 2.6
     factors = randn(count, 3, 3, generator=generator) * 0.15
@@ -45,7 +42,6 @@ def _scene(count=40, dtype=torch.float64, device="cpu"):
 
 
 def _oracle(means, covariances, opacities, colors, camera, background, eps2d=0.3):
-    """One pixel and one Gaussian at a time."""
     (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
     rotation, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
     tan_x, tan_y = camera.width / (2 * fx), camera.height / (2 * fy)
@@ -84,7 +80,6 @@ def _oracle(means, covariances, opacities, colors, camera, background, eps2d=0.3
 
 
 def test_matches_the_loop_over_pixels(device, dtype):
-    """Every rule of compositing occurs in the scene: see the assertions on the loop."""
     background = double([0.9, 0.1, 0.4])
     color, alpha, depth, stopped = _oracle(*_scene(), _camera(), background)
     assert stopped > 10
@@ -220,7 +215,6 @@ def test_bad_shapes_are_named(field, name):
 
 
 def test_a_splat_as_it_is_stored():
-    """Quaternions, logarithms of scales and harmonics give the picture of their covariances and colours."""
     cloud = varied_cloud(40, 2)
     means, opacities = 0.5 * (cloud.means - 1), cloud.opacities.sigmoid()
     quats, log_scales, sh = cloud.quats, cloud.scales, cloud.sh

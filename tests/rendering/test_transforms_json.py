@@ -1,5 +1,3 @@
-"""Cameras of a transforms.json."""
-
 import json
 import math
 

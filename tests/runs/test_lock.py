@@ -1,5 +1,3 @@
-"""One writer per folder, however two of them meet."""
-
 import gc
 import os
 import subprocess
@@ -118,7 +116,6 @@ def test_the_folder_one_is_in(tmp_path, monkeypatch, capsys):
 
 
 def test_a_link_is_followed_and_stays(tmp_path, capsys):
-    """Also one that points to nothing yet."""
     disk, link = tmp_path / "disk", tmp_path / "run"
     disk.mkdir()
     link.symlink_to(disk / "flag", target_is_directory=True)

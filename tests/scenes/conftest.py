@@ -1,5 +1,3 @@
-"""What a leaf should measure."""
-
 import math
 
 import pytest
@@ -14,5 +12,4 @@ def _leaf_area(length, width, taper=(0.55, 0.85)):
 
 @pytest.fixture
 def leaf_area():
-    """Area of the flat outline of a leaf, by its length, width and taper."""
     return _leaf_area

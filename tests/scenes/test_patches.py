@@ -1,5 +1,3 @@
-"""The building blocks of the generated scenes against shapes of known area and normal."""
-
 import math
 
 import pytest

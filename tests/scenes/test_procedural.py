@@ -1,5 +1,3 @@
-"""The generated flag against the sheet it stands for."""
-
 import math
 
 import pytest
@@ -43,7 +41,6 @@ def test_size_and_place():
 
 
 def test_yaw_turns_the_flag_about_its_pole():
-    """Centres and normals turn by the same angle, counter-clockwise from above; the pole side stays."""
     plain, turned = (FlagScene(spacing=0.1, ripple=0.03, yaw=yaw).generate() for yaw in (0.0, -35.0))
     c, s = math.cos(math.radians(35)), math.sin(math.radians(35))
     turn = torch.tensor([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])

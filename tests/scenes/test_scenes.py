@@ -1,5 +1,3 @@
-"""The generated scenes: what they hold, that they repeat, and what they refuse."""
-
 import math
 
 import pytest
@@ -26,10 +24,6 @@ FIELDS = ("means", "quats", "scales", "opacities", "sh", "normals")
 
 @pytest.mark.parametrize("kind", SCENES)
 def test_a_scene_is_a_usable_splat(kind):
-    """Of the promised number of Gaussians, finite, opaque, in colours, with unit normals along the smallest axes.
-
-    With the coarsest spacing that is allowed there are still Gaussians in every part.
-    """
     cloud = DemoScene(kind).generate()
     assert 20_000 <= len(cloud) <= 200_000
     assert all(torch.isfinite(getattr(cloud, name)).all() for name in FIELDS)
@@ -212,7 +206,6 @@ def test_a_wall_stands_before_the_ficus():
 
 
 def test_a_clear_floor_is_fine_and_has_no_shadows():
-    """Small Gaussians of one colour but for its grain within the radius; without it the pot stands in a shadow."""
     found = []
     for radius in (0.0, 2.0):
         cloud = alocasia(spacing=0.02, size=radius)

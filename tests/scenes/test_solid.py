@@ -1,5 +1,3 @@
-"""Generated solids: on their surface, with true normals, solid if asked."""
-
 import math
 
 import pytest
@@ -34,7 +32,6 @@ def test_gaussians_throughout_are_the_shell_and_a_core(shape):
 
 
 def test_normals_are_true():
-    """On the ball radial, on the torus away from the ring, and along the shortest axis of each Gaussian."""
     ball = SolidScene("ball", spacing=0.05, gaussians="shell").generate()
     near(ball.normals, normalized(ball.means), 1e-4)
     torus = SolidScene("torus", spacing=0.05, gaussians="shell").generate()
@@ -47,7 +44,6 @@ def test_normals_are_true():
 
 
 def test_the_shell_covers_the_surface():
-    """Areas of the patches add up to that of the ball; coverage of a jittered lattice is good to a few percent."""
     cloud = SolidScene("ball", spacing=0.05, gaussians="shell").generate()
     assert float(GaussianSurfaceModel.from_cloud(cloud).areas().sum()) == pytest.approx(math.pi, rel=0.05)
 

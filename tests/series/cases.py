@@ -28,7 +28,6 @@ CLASSES = (  # numbers of parts that are no options of their own; not the spacin
 
 
 def unusable(rng, path, *more):
-    """What stood there is missing, or a folder has its name."""
     path.unlink()
     rng.choice((lambda path: None, Path.mkdir, *more))(path)
 
@@ -78,7 +77,6 @@ def yaml_case(rng, folder):
 
 
 def capture_case(rng, folder):
-    """Most are read with all pictures, some trained for a step."""
     poses, names = arc(4), [f"images/{k}.png" for k in range(4)]
     if rng.random() < 0.4:
         write_colmap(folder, poses, [Path(name).name for name in names], binary=rng.random() < 0.6)
@@ -112,7 +110,6 @@ def capture_case(rng, folder):
 
 @functools.cache
 def _run():
-    """A run of two frames, with its checkpoint."""
     from gaussian_swaying.cli.simulate import main
 
     folder = Path(tempfile.mkdtemp(prefix="series-run-")) / "run"
@@ -121,7 +118,6 @@ def _run():
 
 
 def folder_case(rng, folder):
-    """Only what a user can do: commands on a folder that was spoiled."""
     run = shutil.copytree(_run(), folder.parent / "run")
     names = ("checkpoint.pt", "trajectory.npz", "frames/00001.png", "summary.json", "config.yaml", "run.json")
     path = run / rng.choices(names, (8, 4, 3, 3, 2, 2))[0]
@@ -148,7 +144,6 @@ def _splat():
 
 
 def disk_case(rng, folder):
-    """A disk that is full at some byte, or a place that results cannot, or should not, go to."""
     (folder / "full").mkdir()
     for name in ("file", "full/notes.txt"):
         (folder / name).write_text("mine")

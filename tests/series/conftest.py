@@ -1,5 +1,3 @@
-"""The cases are beside the test."""
-
 import sys
 from pathlib import Path
 

@@ -20,7 +20,6 @@ GOOD = ("ran", "refused", "slow, but told")
 
 @pytest.fixture(scope="module")
 def commands():
-    """What the cases are for, imported before a process for each of them is forked."""
     import torch
 
     from gaussian_swaying.captures.capture import read_capture
@@ -33,7 +32,6 @@ def commands():
     Simulation.parser()  # imports what it needs
 
     def look(arguments):
-        """Read a capture with all its pictures, as a training does first."""
         return run_command(lambda: [view.load() for view in read_capture(arguments[0]).views] and None)
 
     tools = {"eval": evaluate.main, "export": export.main, "preview": preview.main, "train": train.main}
@@ -41,7 +39,6 @@ def commands():
 
 
 def _child(command, arguments, folder, said, largest, seconds):
-    """The forked process; it does not return."""
     code = 99
     try:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
@@ -66,7 +63,6 @@ def _child(command, arguments, folder, said, largest, seconds):
 
 
 def verdict(commands, make, largest=0, seconds=SECONDS):
-    """How a case ends: one of ``GOOD``, or what is wrong; and what it said last."""
     with tempfile.TemporaryDirectory(prefix="series-") as name:
         (Path(name) / "input").mkdir()
         command, *arguments = make(Path(name) / "input")
@@ -103,8 +99,6 @@ def test_no_traceback_no_hang_and_no_gigabytes(name, share, commands):
 
 
 def test_verdicts():
-    """It finds what it is for: a traceback, a hang, a hog, a bug and an exit code without a sentence."""
-
     def say(text, code):
         return lambda arguments: print(text, file=sys.stderr) or code
 

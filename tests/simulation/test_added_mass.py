@@ -1,5 +1,3 @@
-"""Air that a sheet carries along: inertia without weight in everything that a stepper does."""
-
 import math
 
 import pytest
@@ -59,7 +57,6 @@ def test_its_frequency_is_that_of_the_plate_with_its_air(hanging):
 @pytest.mark.parametrize("transfer", ["torch", "kernels"])
 @in_both
 def test_a_sheet_falls_slower_as_it_has_to_move_air(formulation, transfer, make_simulation):
-    """By g sigma / (sigma + m)."""
     simulation = make_simulation(
         aero=air(), material=STIFF, wind=WindField(), pinned=False, formulation=formulation, transfer=transfer
     )
@@ -70,7 +67,6 @@ def test_a_sheet_falls_slower_as_it_has_to_move_air(formulation, transfer, make_
 
 
 def test_energy_is_kept_in_still_air_without_drag(hanging):
-    """Kinetic energy is with the air, potential energy without: both are those of the sheet without air at its time."""
     without, carrying = hanging(air(0.0), cfl=0.1), hanging(air(), cfl=0.1, frame_dt=0.04 / SLOWER)
     logs = []
     for simulation in (without, carrying):
@@ -87,7 +83,6 @@ def test_energy_is_kept_in_still_air_without_drag(hanging):
 
 
 def test_the_air_that_is_lifted_is_no_work_of_the_wind(hanging):
-    """To first order in the substep, as forces act between the times of the positions; the sum does not grow."""
     worst = []
     for cfl in (0.1, 0.05):
         _, log = advanced(hanging(air(), cfl=cfl), 25)
@@ -111,7 +106,6 @@ def test_kernels_and_torch_agree(formulation, hanging):
 
 
 def test_a_batch_is_as_each_alone(hanging):
-    """Of two densities, in other winds."""
     first = hanging(air(drag=0.5), wind=WindField([1.0, 4.0, 0.0]), substep=0.004)
     other = first.variant({"material.density": 50.0, "wind.speed": 2.0})
     batch = first.batch([first.model, other.model])
@@ -161,8 +155,6 @@ def test_an_edit_keeps_the_air(hanging):
 
 
 def test_gradients_by_the_density_pass(hanging):
-    """Compared with the difference of two runs."""
-
     def end(density):
         simulation = hanging(air(), material=STIFF, substep=0.004)
         state = simulation.start()

@@ -1,5 +1,3 @@
-"""What a GPU needs is loaded in a thread, while the scene is made."""
-
 import threading
 from contextlib import contextmanager
 

@@ -1,5 +1,3 @@
-"""Scenes in which only what is connected along its surface shares nodes."""
-
 import dataclasses
 
 import pytest
@@ -19,7 +17,6 @@ DX, GAP = 0.2, 0.13
 
 
 def two_flags(gap=GAP):
-    """Two flags one in front of the other, nearer than a cell, and which of them each Gaussian belongs to."""
     flag = FlagScene(spacing=0.03, width=0.9, height=0.6).generate()
     far = dataclasses.replace(flag, means=flag.means + torch.tensor([0.0, gap, 0.0]))
     return together(flag, far), torch.arange(2).repeat_interleave(len(flag.means))
@@ -45,7 +42,6 @@ def ends(run, frames=4):
 @pytest.mark.parametrize("points", ["grid", "gaussian"])
 @pytest.mark.parametrize("layers", [1, 3])
 def test_flags_closer_than_a_cell_move_as_alone(points, layers):
-    """Each in the wind that it has, as none is behind the other for it."""
     cloud, number = two_flags()
     how = {"points": points, "layers": layers, "area": "coverage"}
     both, state = ends(simulation(cloud, **how))
@@ -70,7 +66,6 @@ def test_one_flag_is_the_same_bit_for_bit(points):
 
 
 def test_parts_correct_what_was_found():
-    """Flags that lie on each other are one skin, unless a part says what it is attached to."""
     cloud, number = two_flags(gap=0.02)
     flags = [Part("pole", "held"), Part("near", attached="pole"), Part("far", attached="pole")]
     labels = torch.where(cloud.means[:, 0] < 0.1, 0, number + 1)

@@ -1,5 +1,3 @@
-"""Contact and obstacles in the front door and in a configuration."""
-
 import dataclasses
 import warnings
 
@@ -33,7 +31,6 @@ def _ball(contact=None, boundaries=None, **more):
 
 
 def _fallen(simulation, frames):
-    """Where the cloth is after some frames, and how far outside the ball."""
     *_, frame = simulation.frames(frames)
     means = frame.gaussians.means[simulation.scene.simulated]
     return means, (means - torch.tensor([0.0, 0.0, 0.35])).norm(dim=-1) - 0.3
@@ -71,7 +68,6 @@ def test_the_distance_from_gaussians_is_that_of_the_ball_that_they_cover():
 
 
 def _two_sheets(gap):
-    """Two level sheets above each other."""
     one = FlagScene(0.4, 0.4, 0.02, ripple=0.0).generate()
     other = dataclasses.replace(one, means=one.means + torch.tensor([0.0, gap, 0.0]))
     return GivenScene(together(one, other))

@@ -62,7 +62,6 @@ def _coloured(degree=1):
 
 
 def _along(*borders):
-    """The part of each Gaussian, by borders along x."""
     return torch.bucketize(_coloured().means[:, 0].contiguous(), torch.tensor(borders))
 
 
@@ -81,7 +80,6 @@ def _simulation(copies=(), wind=None, cloud=None, solver=None, scene=None, **mor
 
 
 def _end(simulation, frames=4):
-    """The last of some frames."""
     return list(simulation.frames(frames))[-1]
 
 
@@ -119,7 +117,6 @@ def test_all_take_the_substeps_of_the_fastest():
 
 @pytest.mark.parametrize("degrees", [37.0, 90.0, -120.0])
 def test_a_turned_copy_in_a_turned_wind_moves_alike(degrees):
-    """Turned with the wind, it sees the same wind, and everything that is drawn is turned about its foot."""
     flow = double([6.0, 1.5, 0.4])
     one, other = (
         _end(
@@ -162,7 +159,6 @@ def test_a_delay_is_the_same_wind_later():
 
 
 def test_each_has_gusts_of_its_own():
-    """Seeds are those of the wind and the next ones, unless they are given; with a delay those of the wind."""
     copies = [Copy(), Copy(), Copy(seed=40), Copy(delay=0.5), Copy(delay=0.5, seed=7)]
     simulation = _simulation(copies, _gusty(5))
     assert simulation.stepper.wind_force.wind.seed.tolist() == [5, 6, 40, 5, 7]
@@ -171,7 +167,6 @@ def test_each_has_gusts_of_its_own():
 
 
 def test_numbers_change_and_edits_act_on_all():
-    """As with one object: another wind, and a part that becomes stiff and red; what does not move is there once."""
     simulation = _simulation(ROW, edits=[Edit(time=0.04, E=3e5, color=[1.0, 0.0, 0.0])])
     frames = simulation.frames(4)
     first = next(frames)
@@ -203,7 +198,6 @@ def test_numbers_change_and_edits_act_on_all():
     ids=["region", "points", "free"],
 )
 def test_the_axis_of_a_turn(hold, axis):
-    """It goes through what the pins hold, or through the middle of an object that nothing holds."""
     simulation = _simulation([Copy(), Copy(turn=180.0)], solver={"boundaries": [hold] if hold else []})
     means = next(simulation.frames(1)).gaussians.means[10:].reshape(2, 96, 3)
     near((means[0] + means[1])[:, :2], (2 * axis[:2]).expand(96, 2), 0.02)
@@ -211,7 +205,6 @@ def test_the_axis_of_a_turn(hold, axis):
 
 
 def test_metres_and_the_up_direction_of_the_scene():
-    """The shift is in metres along the axes of the wind; a turn keeps the height, wherever up is in the splat."""
     cloud = _coloured()
     cloud = replace(cloud, means=cloud.means[:, [0, 2, 1]] * torch.tensor([1.0, -1.0, 1.0]))
     scene = {"up": [0.0, -1.0, 0.0], "metres_per_unit": 0.5, "region": up_to(y=2.0)}
@@ -247,7 +240,6 @@ def test_a_rigid_part_is_a_body_of_each_copy(formulation):
 
 
 def test_a_held_part_belongs_to_the_copy_and_a_still_one_does_not():
-    """A pot with its plant: drawn in each copy where it is held, which is what a copy turns about."""
     labels = _along(0.25)
     labels[96:] = 2
     parts = Parts(labels, [Part("pole", "held"), Part("cloth"), Part("floor", "still")])
@@ -271,7 +263,6 @@ def test_a_held_part_belongs_to_the_copy_and_a_still_one_does_not():
 
 @pytest.mark.parametrize("shader", [None, DiffuseShader([0.3, -0.5, 0.8], two_sided=True, ambient=0.4, relative=True)])
 def test_harmonics_turn_with_the_copy(shader):
-    """Colours are those of harmonics that were turned, and light falls on them where they stand."""
     simulation = _simulation([Copy(turn=90.0)], shader=shader)
     frame = next(simulation.frames(1))
     gaussians, painter, scene = frame.gaussians, simulation.painter, simulation.scene
@@ -301,7 +292,6 @@ def test_the_camera_sees_all_of_them():
 
 
 def test_a_run(tmp_path):
-    """Pictures, depth, normals and a film."""
     recorder = Recorder(trajectory=False, nodes=False, renders=("color", "depth", "normal"))
     whole = _simulation(ROW, _gusty()).run(tmp_path / "whole", 4, progress=False, recorder=recorder)
     assert (whole["copies"], whole["particles"], whole["gaussians"]) == (3, 96, 106)
@@ -335,7 +325,6 @@ def test_the_example_of_the_page(capsys):
 
 @pytest.mark.gpu
 def test_on_a_gpu():
-    """The same motion and picture as on a CPU; kernels and graphs of the wind are used from the second frame on."""
     frames = []
     for device in ("cpu", "cuda"):
         frames.append(_end(_simulation(ROW, _gusty(), device=device), 6))

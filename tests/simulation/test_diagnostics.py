@@ -1,5 +1,3 @@
-"""Numbers of known states, and who is to blame for bad ones."""
-
 import itertools
 import math
 
@@ -75,7 +73,6 @@ def test_numbers_of_a_known_state():
 
 
 def test_forces_on_supports(make_simulation):
-    """The momentum that each boundary took in the frame over its time; a plane far away takes none."""
     pin, plane = PinnedRegion(up_to(x=0.11)), Wall(HalfSpace([0, 0, -9], [0, 0, 1]))
     simulation = make_simulation(pinned=False, boundaries=[pin, plane])
     before = simulation.start()
@@ -154,7 +151,6 @@ def _refused(solver, state, told):
 
 
 def test_what_is_worst_is_named_first():
-    """Of one particle that is several things at once; of several particles the first."""
     solver, state = _solver()
     lost = torch.zeros(30, dtype=torch.bool)
     lost[[5, 6]] = True

@@ -1,5 +1,3 @@
-"""Material and colour of a part of the object, changed at load and during a run."""
-
 import dataclasses
 
 import numpy as np
@@ -123,7 +121,6 @@ def test_a_colour_at_load_is_that_of_the_first_picture(make_simulation, tmp_path
 
 
 def test_no_region_is_all_that_moves(make_cloud, make_simulation):
-    """Also those that are carried along, but not what stays; a region reaches what stays too."""
     cloud = make_cloud()
     cloud.opacities[5] = -6.0
     settings = {"pinned": False, "scene": {"region": up_to(x=0.5)}}
@@ -190,7 +187,6 @@ def test_sand_becomes_foam(make_cloud, make_simulation):
 
 
 def test_what_has_flowed_and_turns_elastic_keeps_its_shape(make_cloud, make_simulation):
-    """Both deformations go on: the elastic one drives the stress, the total one covariances and normals."""
     material = Material(E=1e5, density=1000.0, thickness=0.2, law=Plasticine(1.0, 0.0, 1.0))
     simulation = make_simulation(make_cloud(60, degree=0), material=material, pinned=False, formulation="updated")
     state = simulation.start()
@@ -262,7 +258,6 @@ def test_what_cannot_be_is_refused_before_anything_is_written(make_simulation, t
 
 @pytest.mark.gpu
 def test_a_gpu_goes_on_with_new_graphs(make_simulation):
-    """The kernels and graphs that were recorded hold the old stiffness."""
     ends = []
     for device in ("cpu", "cuda"):
         simulation = make_simulation().to(device)

@@ -1,5 +1,3 @@
-"""Sizes that make no sense are refused, odd ones are warned of."""
-
 import torch
 from shared import user_warning, value_error
 
@@ -36,7 +34,6 @@ def test_an_object_smaller_than_the_grid():
 
 
 def test_a_bent_tube_of_few_cells_across_says_so():
-    """Whichever way it points; not a wide tube, a ribbon, a cord of points in line, or one that hardly moves."""
     turn, along = torch.meshgrid(torch.arange(8) * torch.pi / 4, torch.arange(50) * 0.01, indexing="ij")
     tube = torch.stack([0.02 * turn.cos(), 0.02 * turn.sin(), along], dim=-1).reshape(-1, 3)
     tilted = tube @ torch.linalg.qr(torch.tensor([[1.0, 2, 3], [0, 1, 4], [5, 6, 0]]))[0]

@@ -159,7 +159,6 @@ def test_what_is_wrong_or_said_twice_is_refused(given, words):
 
 
 def test_the_grid_is_that_of_the_solver_everywhere():
-    """`dx` decides volumes of cells and points of the grid too: one number."""
     scene = Scene(generator=FlagScene(spacing=0.05), points="grid")
     counts = []
     for dx in (0.1, 0.2):
@@ -175,7 +174,6 @@ def test_the_grid_is_that_of_the_solver_everywhere():
 
 
 def test_the_constructor_is_the_schema():
-    """Each argument is an option, and there is no option besides those of the command line."""
     parser = Simulation.parser()
     options = {name.split(".")[0] for name in parser.get_defaults().keys(branches=True)}
     names = set(arguments_of(Simulation))
@@ -260,7 +258,6 @@ def test_a_frame_is_read_before_an_edit_changes_its_colours():
 
 
 def _in_four_threads(work):
-    """What ``work(k)`` returns or raises in four threads that begin together, and change places all the time."""
     begin, found, before = threading.Barrier(4), [None] * 4, sys.getswitchinterval()
 
     def one(k):
@@ -363,7 +360,6 @@ FALLS = "Nothing holds the object"
     ],
 )
 def test_gravity_of_what_is_held_and_of_what_falls(given, down, told):
-    """However it is held, its shape was captured in balance; what falls is told."""
     flag = FlagScene(spacing=0.1)
     given = dict(given)
     held = given.pop("held", False)
@@ -481,7 +477,6 @@ def test_a_splat_is_read_once(more, monkeypatch):
 
 
 def test_what_a_run_was_made_from_is_described_once(tmp_path, monkeypatch):
-    """A checkpoint of each frame holds it, and a large splat takes a while."""
     described = []
     monkeypatch.setattr(
         "gaussian_swaying.simulation.simulation.python_text", lambda *a: described.append(a) or "a: 1\n"

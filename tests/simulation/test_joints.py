@@ -1,5 +1,3 @@
-"""Parts of a splat that a joint connects: what hangs on it stays there and turns."""
-
 import dataclasses
 
 import torch
@@ -17,7 +15,6 @@ DX = 0.1
 
 
 def flags():
-    """A beam of cloth that is held, and one that continues it along x; which of them each Gaussian belongs to."""
     flag = FlagScene(spacing=0.04, width=0.6, height=0.2).generate()
     other = dataclasses.replace(flag, means=flag.means + torch.tensor([0.6, 0.0, 0.0]))
     return together(flag, other), torch.arange(2).repeat_interleave(len(flag.means))

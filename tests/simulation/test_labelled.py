@@ -116,7 +116,6 @@ def test_faint_gaussians_of_a_held_part_and_those_that_follow_it_stay():
 
 
 def test_hidden_parts_are_taken_away():
-    """The rest moves as that splat alone; nothing of the hidden part is drawn."""
     hidden = Parts(labels(), [ROLES[0], ROLES[1], Part("cloth"), Part("hem", "hidden")])
     rest = labels() < 3
     alone = CLOUD.select(rest)

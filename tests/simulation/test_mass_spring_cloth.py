@@ -37,7 +37,6 @@ def simulation(cloth):
 
 
 def test_the_example_agrees_with_the_material_points(cloth, tmp_path, capsys):
-    """Two solvers of one flag that only bends: what differs is their bending, which neither resists."""
     assert cloth.main(tmp_path, frames=12) < 0.1
     assert "of the way" in capsys.readouterr().out
     summary = json.loads((tmp_path / "springs" / "summary.json").read_text())
@@ -149,7 +148,6 @@ def test_a_yaml_names_a_solver_and_a_wind(tmp_path, monkeypatch, capsys):
 
 
 def test_the_live_page_moves_it(simulation, tmp_path):
-    """A session steps it, changes its wind in motion, and pulls at it."""
     settings = {"scene": {"generator": {"class_path": "FlagScene", "init_args": {"spacing": 0.05}}}, "device": "cpu"}
     settings["wind"] = {"flow": [1.0, 2.5, 0.0]}
     (tmp_path / "scene.yaml").write_text(yaml.safe_dump(settings))

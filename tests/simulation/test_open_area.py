@@ -31,7 +31,6 @@ def capture(tmp_path_factory):
 
 
 def simulated(dx=0.2, material=None, **settings):
-    """The scene in metres."""
     return SimulatedScene(Scene(metres_per_unit=0.5, **settings), material or Material(), dx)
 
 

@@ -1,5 +1,3 @@
-"""The configurations of the paper's scenes: its numbers, and their presets."""
-
 from pathlib import Path
 
 import pytest

@@ -1,5 +1,3 @@
-"""Parameters: each is read and written in one place, a number of a user's own force too."""
-
 import json
 import math
 import sys
@@ -69,7 +67,6 @@ def _close(found, wanted):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_what_is_written_is_read_and_is_that_of_the_configuration(name, config, parser):
-    """In a model, in a simulation that goes on, and in settings, from which a simulation is made."""
     simulation = Simulation.from_yaml(config, device="cpu")
     before = simulation.model
     old = before.value(name)
@@ -160,7 +157,6 @@ def test_gradients_are_kept(name, config):
 
 
 def _stiffened(monkeypatch, bound_anew, scene, **more):
-    """Positions after a change of the stiffness in motion, and how often the solver took a material."""
     taken = []
     with monkeypatch.context() as patched:
         take = MPMSolver.init_state
@@ -263,7 +259,6 @@ def test_a_number_of_a_users_force_is_swept(breath, parser, tmp_path):
 
 @pytest.mark.parametrize("backwards", [False, True])
 def test_parameters_that_are_no_options_are_swept_too(backwards, config, parser, tmp_path):
-    """Of still air the angles wait for the speed."""
     still = CONFIG | {"wind": CONFIG["wind"] | {"flow": [0.0, 0.0, 0.0]}}
     (tmp_path / "still.yaml").write_text(yaml.safe_dump(still))
     axes = {"wind.speed": [2.0, 3.0], "wind.azimuth": [90.0], "wind.modulations.0.period": [1.5]}
@@ -280,7 +275,6 @@ def test_parameters_that_are_no_options_are_swept_too(backwards, config, parser,
 
 
 def test_a_variant_is_a_simulation_of_its_own(tmp_path):
-    """As one that is made with these numbers, also after the first was started again, and with the same edits."""
     edits = [Edit(region=beyond(x=0.5), color=[1.0, 0.0, 0.0], detail=0.5)]
 
     def made(**material):

@@ -63,7 +63,6 @@ def test_mass_centre_volume_and_area_are_kept_by_few_points(per_cell, make_scene
     ],
 )
 def test_points_of_a_group_have_its_moments(sizes, count):
-    """Mass, centre and covariance; as many points as the group has directions, two along each."""
     generator = seeded(0)
     place = randn(600, 3, generator=generator) * torch.tensor(sizes)
     place = place @ torch.linalg.qr(randn(3, 3, generator=generator))[0]
@@ -96,7 +95,6 @@ def test_points_of_a_full_cell_are_those_of_gauss():
 
 
 def test_groups_do_not_cross_borders(make_scene):
-    """Of materials, laws and the regions of pins and edits."""
     stiff = MaterialRegion(HALF, E=9e4, law=NeoHookean())
     edge, corner = up_to(x=0.031), beyond(z=0.3051)
     scene = SimulatedScene(
@@ -133,7 +131,6 @@ def test_regions_of_pins_and_edits_reach_the_scene(make_simulation):
 
 
 def test_everything_follows_a_linear_motion_and_stays_at_rest(make_scene):
-    """A linear field of the nodes takes every Gaussian, faint ones too, where it takes its place."""
     scene = make_scene(fine_flag(), dx=0.15, points="grid", up=[0.0, -1.0, 0.0], metres_per_unit=0.5)
     state = MPMSolver(0.15).init_state(scene.points)
     assert torch.equal(scene.deformed(state).means, scene.rest().means)
@@ -151,7 +148,6 @@ def test_everything_follows_a_linear_motion_and_stays_at_rest(make_scene):
 
 
 def test_no_gaussian_follows_a_node_without_mass(make_cloud):
-    """A random cloud of very unequal masses: wherever the material goes, all of it goes."""
     cloud = make_cloud(3000)
     cloud = dataclasses.replace(cloud, scales=cloud.scales - 4 * torch.rand(3000, 1))
     dx = 0.11
@@ -209,7 +205,6 @@ def test_three_layers_share_the_normal_of_their_group(make_scene):
 
 
 def test_a_solid_is_grouped_too():
-    """Surface and inside are never mixed, and mass and wind stay the same."""
     settings = {
         "generator": SolidScene(shape="ball", size=0.6, spacing=0.03, gaussians="shell"),
         "filling": InteriorFilling(),
@@ -223,7 +218,6 @@ def test_a_solid_is_grouped_too():
 
 
 def test_the_force_is_known_for_every_gaussian(make_simulation):
-    """The picture of the wind's pressure does not depend on which points carry the material."""
     found = {}
     for points in ("gaussian", "grid"):
         simulation = make_simulation(cloud=fine_flag(), dx=0.15, scene={"points": points})
@@ -295,7 +289,6 @@ def test_points_of_a_group_share_its_wind(law, make_scene):
 
 
 def test_a_coarse_splat_keeps_its_gaussians(make_scene):
-    """No more points than Gaussians: where a cell has as few as four, each is a point at its own place."""
     scene = make_scene(FlagScene(spacing=0.05).generate(), dx=0.1, points="grid")
     assert scene.points.count == len(scene.simulated)
     torch.testing.assert_close(scene.points.position[scene.owner], scene.follow.place)
@@ -311,7 +304,6 @@ def test_a_single_gaussian():
 
 @pytest.mark.gpu
 def test_recorded_measurements_are_those_of_the_frame(make_simulation):
-    """From the second frame on they are replayed from a graph, also after an edit."""
     simulation = make_simulation(cloud=fine_flag(), dx=0.15, scene={"points": "grid"}).to("cuda")
     with torch.inference_mode():
         state = simulation.start()

@@ -20,8 +20,6 @@ RUN = [f"--config={FLAG}", "--device=cpu", *words(SMALL | {"solver.boundaries": 
 
 @pytest.fixture
 def clock(monkeypatch):
-    """A clock that is set by hand."""
-
     class Clock:
         now = 0.0
 
@@ -87,7 +85,6 @@ def test_a_frame_that_is_done_again_is_counted_anew(clock, capsys):
 @in_both
 @pytest.mark.parametrize("looks", [1, 8])
 def test_watching_changes_no_bit(formulation, looks):
-    """And every substep is told of, in order."""
     solver = MPMSolver(0.25, formulation, transfer="torch")
     points = MaterialPoints.create(
         torch.rand(200, 3), volume=1e-3, density=100.0, youngs_modulus=1e4, poisson_ratio=0.3
@@ -129,7 +126,6 @@ def test_a_frame_that_gets_too_many_substeps_ends_the_run(tmp_path, capsys, monk
 
 
 def test_the_cameras_of_as_many_frames_as_there_may_be(tmp_path, monkeypatch):
-    """Some of them are looked at, with the first and the last."""
     seen = []
     monkeypatch.setattr(Painter, "check_camera", lambda self, frame: seen.append(frame))
 

@@ -74,7 +74,6 @@ def test_the_frames_of_a_run_are_those_of_its_simulation(recorded):
 
 @pytest.mark.parametrize("format", FORMATS)
 def test_a_run_is_exported_in_every_format(recorded, format, tmp_path, capsys):
-    """The folder is made; each file is what its Gaussians write; USD has the times of the run."""
     simulation, run = recorded
     if format == "usd":
         pytest.importorskip("pxr")
@@ -156,7 +155,6 @@ def test_a_run_without_its_motion_is_refused(recorded, tmp_path, capsys):
 
 
 def test_a_frame_saves_its_gaussians(recorded, tmp_path):
-    """By the ending or by the name of a format; metres and axes where the format has them."""
     simulation, _ = recorded
     (frame,) = simulation.frames(1)
     for format, known in FORMATS.items():

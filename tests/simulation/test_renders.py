@@ -1,5 +1,3 @@
-"""Several cameras and several renders in one run."""
-
 import imageio.v3 as iio
 import numpy as np
 import pytest
@@ -93,7 +91,6 @@ def test_normals_in_world_axes_are_those_of_the_z_up_frame(flag_ply, make_simula
 
 
 def test_the_force_is_that_of_the_wind(make_simulation):
-    """Full drag and friction on a patch at rest, which the wind meets head-on, and nothing in still air."""
     aero = AeroForce(C_D=0.5, C_F=0.0, C_L=0.0)
     simulation = make_simulation(wind=WindField([0.0, 4.0, 0.0]), aero=aero)
     state = simulation.start()
@@ -111,7 +108,6 @@ def test_the_force_is_that_of_the_wind(make_simulation):
 
 
 def test_values_reach_every_gaussian_that_moves(make_cloud, make_scene):
-    """Faint ones take that of the neighbour that carries them; those outside the region have none."""
     cloud = make_cloud()
     cloud.opacities[5] = -6.0
     scene = make_scene(cloud, region=up_to(x=0.5))
@@ -158,7 +154,6 @@ def test_a_camera_that_does_not_move_is_made_once(make_simulation):
 
 
 def test_motion_and_colours_are_those_of_the_scene_in_every_frame(make_simulation, device):
-    """On a GPU they are replayed from the second frame on: other states, cameras, lights and colours count."""
     simulation = make_simulation(dx=0.2, scene={"points": "grid"}).to(device)
     painter, scene = simulation.painter, simulation.scene
     painter.shader = DiffuseShader([0.3, -0.6, 1.0]).to(device)

@@ -1,5 +1,3 @@
-"""Very stiff material in the wind: how much energy rounding adds, and where it is refused."""
-
 import torch
 from shared import up_to, value_error
 
@@ -16,7 +14,6 @@ def _flag(E, dtype, wind=(6.0, 1.5, 0.0), **settings):
 
 
 def _energy(simulation, frames):
-    """Energy that nothing has put in, the work of the wind, and the number of substeps."""
     state, work, steps = simulation.start(), 0.0, 0
     for _ in range(frames):
         state, health = simulation.advance(state)

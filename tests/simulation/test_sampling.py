@@ -1,5 +1,3 @@
-"""Groups of samples."""
-
 import dataclasses
 
 import pytest
@@ -14,7 +12,6 @@ FRAME = SimFrame(torch.zeros(3, dtype=DOUBLE), torch.eye(3, dtype=DOUBLE), 0.5)
 
 
 def _pairs():
-    """Eight samples in one cell, on one sheet, two by two at the same place."""
     place = double([[0.9, 0.9, 1.0], [1.1, 0.9, 1.0], [0.9, 1.1, 1.0], [1.1, 1.1, 1.0]])
     each = {
         name: torch.ones(8, dtype=DOUBLE)

@@ -1,5 +1,3 @@
-"""The Gaussians that move, their weight, and how they follow the material."""
-
 import dataclasses
 import math
 
@@ -36,7 +34,6 @@ def _rotation(dtype=torch.float64):
 
 
 def _faint_cloud(make_cloud):
-    """Forty Gaussians; the odd ones are faint."""
     cloud = make_cloud()
     opacities = cloud.opacities.clone()
     opacities[1::2] = math.log(0.05 / 0.95)
@@ -60,7 +57,6 @@ def test_the_region_chooses_and_the_rest_stays(make_cloud, make_scene):
 
 @pytest.mark.parametrize("faint", ["carry", "static", "drop"])
 def test_faint_gaussians(faint, make_cloud, make_scene):
-    """They are no particles in any case; they follow, stay, or are gone."""
     cloud = _faint_cloud(make_cloud)
     scene = make_scene(cloud, faint=faint)
     assert scene.points.count == 20
@@ -115,7 +111,6 @@ def test_nothing_moves_at_rest(up, make_cloud, make_scene):
 @pytest.mark.parametrize("up", UPS)
 @pytest.mark.parametrize("settings", [{}, {"region": LEFT}, {"region": LEFT, "opacity_threshold": 0.0}])
 def test_rotations_are_left_out_where_nobody_asks(up, settings, make_cloud, make_scene):
-    """And those that move are the same Gaussians whether they are all, in their order, or some."""
     scene = make_scene(_faint_cloud(make_cloud) if settings else None, up=up, **settings)
     assert scene.all_move == (not settings)
     assert torch.equal(scene.moving, torch.cat([scene.simulated, scene.carried]))
@@ -136,7 +131,6 @@ def test_rotations_are_left_out_where_nobody_asks(up, settings, make_cloud, make
 
 @pytest.mark.parametrize("up", UPS)
 def test_a_rigid_motion_moves_everything_rigidly(up, make_cloud, make_scene):
-    """Rotation and translation given in metres; the Gaussians turn by its picture in scene axes."""
     scene = make_scene(_faint_cloud(make_cloud), up=up, longest_side=0.5, dtype=torch.float64)
     state, frame = _rest_state(scene), scene.frame
     R, shift = _rotation(), double([0.2, -0.1, 0.4])
@@ -180,7 +174,6 @@ def test_gaussians_keep_to_the_stretch_of_the_scene(settings, make_cloud, make_s
 
 
 def test_what_is_torn_is_drawn_as_a_patch_of_a_solid_and_as_a_grain_of_sand(make_scene):
-    """By default. The law is that of the moment: an edit may have changed it. Honest stretch is drawn as it is."""
     sheet = FlagScene(spacing=0.2, ripple=0.0).generate()
     material = Material(regions=[MaterialRegion(LEFT, law=Sand(35.0))])
     solid, mixed, free = make_scene(sheet), make_scene(sheet, material), make_scene(sheet, max_stretch=None)
@@ -257,7 +250,6 @@ def test_simulations_of_the_same_gaussians_compute_their_areas_once(make_cloud, 
 
 
 def test_areas_as_in_the_paper_and_equal_ones(make_cloud, make_scene):
-    """Equal ones have the sum of those by coverage."""
     cloud = make_cloud()
     s = cloud.scales.exp().sort(dim=-1).values
     scene = make_scene(cloud, area="paper", metres_per_unit=2.0)
@@ -267,7 +259,6 @@ def test_areas_as_in_the_paper_and_equal_ones(make_cloud, make_scene):
 
 
 def test_cell_rule(make_scene):
-    """Three particles share one cell, one has another to itself."""
     position = torch.tensor([[0.1, 0.1, 0.1], [0.2, 0.3, 0.4], [0.4, 0.4, 0.4], [-0.1, 0.1, 0.1]])
     torch.testing.assert_close(cell_volume(position, 0.5), torch.tensor([1, 1, 1, 3]) * 0.125 / 3)
     scene = make_scene(material=Material(volume="cell", density=10.0), dx=0.25)
@@ -276,7 +267,6 @@ def test_cell_rule(make_scene):
 
 
 def test_material_regions(make_cloud, make_scene):
-    """Later entries win, what is null stays."""
     material = Material(
         E=1e4,
         nu=0.2,
@@ -311,7 +301,6 @@ TOP = Box([None, None, 0.55], [None, None, 0.75])  # of a flag with z up
 @pytest.mark.parametrize("what", ["scene", "boundary", "material", "edits"])
 @pytest.mark.parametrize("far", [False, True])
 def test_a_region_in_the_axes_of_the_wind_says_so(what, far, make_simulation):
-    """Regions are in scene axes, `wind.flow` has z up: the message has both, and says what is only turned."""
     cloud, up = FlagScene(spacing=0.1).generate(), [0.0, -1.0, 0.0]
     means = cloud.means @ rotation_from_z(up).T.to(cloud.means)
     region = Box([5.0, 5.0, 5.0], [6.0, 6.0, 6.0]) if far else TOP
@@ -391,7 +380,6 @@ def _sheet_with_a_hole():
 
 
 def test_large_gaussians_get_further_points(make_scene):
-    """They follow the Gaussians, have normals, areas and material of their own place, and are not drawn."""
     cloud = _sheet_with_a_hole()
     count = len(cloud)
     lower = MaterialRegion(region=up_to(z=0.49), density=1000.0)
@@ -428,7 +416,6 @@ def test_the_spacing_of_further_points_is_in_metres_and_they_share_the_papers_ar
 
 
 def test_three_layers_are_no_thicker_than_a_cell(make_scene):
-    """Else nothing holds the middle one to the faces: a motion that takes it off them strains none of the layers."""
     cloud, thin, thick = _sheet_with_a_hole(), Material(thickness=0.1), Material(thickness=0.11)
     assert make_scene(cloud, thin, 0.1, layers=3).points.count
     assert make_scene(cloud, thick, 0.1, layers=1).points.count
@@ -475,7 +462,6 @@ def test_bending_says_where_the_layers_lie(make_cloud, make_scene):
 
 @pytest.mark.parametrize("law", [FixedCorotated(), NeoHookean()])
 def test_a_negative_ratio_whose_energy_has_no_least_value_is_warned_of(law, make_scene):
-    """Stretched or compressed far enough, the energy falls below that at rest; Hencky's never does."""
     nu, E = double(-0.3), double(1.0)
     lame = E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
     sizes = torch.logspace(-3, 1, 41, dtype=torch.float64)
@@ -503,7 +489,6 @@ def test_layers_share_the_volume_of_a_cell(make_scene):
 
 
 def test_normals_from_neighbours(make_cloud, make_scene):
-    """Of a sheet whose Gaussians are turned at random: patches, pictures and pressure use the normal of the sheet."""
     generator = seeded(2)
     cloud = FlagScene(width=0.6, height=0.4, spacing=0.02, ripple=0.0).generate()
     turn = torch.nn.functional.pad(0.15 * torch.randn(len(cloud.means), 3, generator=generator), (1, 0), value=1.0)
@@ -521,7 +506,6 @@ def test_normals_from_neighbours(make_cloud, make_scene):
 
 
 def test_a_trajectory_has_the_whole_deformation(make_scene):
-    """Where a material flows, its elastic part differs from it."""
     scene = make_scene(FlagScene(spacing=0.2).generate(), Material(law=Sand(35.0)))
     state = MPMSolver(0.4, "updated").init_state(scene.points)
     state = state.replace(F_total=1.5 * state.F_total)

@@ -1,5 +1,3 @@
-"""Frames from components: substeps, wind, cameras, colours and pictures."""
-
 import copy
 import dataclasses
 import json
@@ -84,7 +82,6 @@ def test_aerodynamics_are_asked_only_where_they_can_push(make_simulation, monkey
 
 
 def test_still_air_resists_a_fall(make_simulation):
-    """No wind is not no air: a light free flag falls slower than in a vacuum, broadside most of all."""
     light = Material(E=1e3, density=10.0, thickness=1e-3)
     speed = []
     for air in (0.0, 1.225):
@@ -106,7 +103,6 @@ def test_a_coefficient_that_became_nan_is_named(make_simulation, name):
 
 
 def test_a_grid_that_was_outrun_is_enlarged(make_simulation):
-    """A strong wind takes an unpinned flag farther in one frame than its speed at the start foretells."""
     simulation = make_simulation(wind=WindField([0.0, 25.0, 0.0]), pinned=False, formulation="updated")
     state, _ = advanced(simulation, 3)
     assert not state.lost.any()
@@ -300,7 +296,6 @@ def _colours(simulation, state, frame=0):
 
 
 def test_colours_turn_with_the_object(make_cloud, make_simulation):
-    """Object and eye turned alike about the object's centre: the same colours. The eye left behind: other ones."""
     simulation = make_simulation(make_cloud(), pinned=False, scene={"up": [0.0, -1.0, 0.0], "longest_side": 0.5})
     frame, state, R = simulation.scene.frame, simulation.start(), _turn()
     turned = state.replace(position=(state.position.double() @ R.T).float(), F_total=R.float().expand_as(state.F_total))
@@ -336,7 +331,6 @@ def test_only_moving_gaussians_are_shaded(make_cloud, make_simulation):
 
 
 def test_the_light_is_given_in_the_z_up_frame(make_simulation):
-    """y up in the scene: a sheet whose normal is y is fully lit by light from above."""
     flag = FlagScene(spacing=0.1, ripple=0.0, pattern="white").generate()
     shader = DiffuseShader([0.0, 0.0, 1.0], two_sided=True)
     for up, factor in (([0.0, 1.0, 0.0], 1.0), ([0.0, 0.0, 1.0], 0.0)):
@@ -385,7 +379,6 @@ PICTURES = {
 @pytest.mark.parametrize("shader", [None, DiffuseShader()], ids=["plain", "diffuse"])
 @pytest.mark.parametrize("degree", [0, 3])
 def test_many_still_gaussians_are_coloured_once(degree, shader, make_cloud, make_simulation, monkeypatch):
-    """As the others are coloured, with another camera and after an edit too."""
     part = {"region": up_to(x=0.6)}
     cloud = make_cloud(degree=degree)
     simulation = make_simulation(cloud, pinned=False, shader=shader, scene=part)
@@ -410,7 +403,6 @@ def test_many_still_gaussians_are_coloured_once(degree, shader, make_cloud, make
 
 @pytest.fixture
 def many_still(make_cloud, make_simulation, monkeypatch):
-    """A function that makes a run whose colours of what does not move are kept."""
     monkeypatch.setattr("gaussian_swaying.simulation.draw.RECORDED", 7)
     part = {"region": up_to(x=0.6)}
     return lambda: make_simulation(make_cloud(degree=1), pinned=False, scene=part)
@@ -445,7 +437,6 @@ def test_harmonics_of_still_gaussians_have_gradients(many_still):
 
 
 def test_colours_of_a_run_that_was_made_in_inference_mode(many_still):
-    """Its tensors do not tell whether they were changed in place: nothing is kept."""
     with torch.inference_mode():
         painter = many_still().painter
         inside = painter.colors(painter.scene.rest(), painter.camera_at(0))
@@ -466,7 +457,6 @@ def _on_gpu(simulation):
 @pytest.mark.parametrize("name", PICTURES)
 @pytest.mark.parametrize("degree", [0, 3])
 def test_a_picture_never_makes_the_host_wait(name, degree, make_cloud, make_simulation, monkeypatch):
-    """But in gsplat, which asks how many tiles the Gaussians touch: what happens in there is not looked at."""
     gsplat = pytest.importorskip("gsplat")
     shader, settings = PICTURES[name]
     camera = OrbitCamera(width=64, height=36, degrees_per_second=100.0)

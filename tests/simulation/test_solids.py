@@ -1,5 +1,3 @@
-"""Filled solids in a run: what they weigh, where the wind acts, and that nobody sees the filling."""
-
 import dataclasses
 import math
 from pathlib import Path
@@ -82,7 +80,6 @@ def test_filled_points_feel_no_wind():
 
 
 def test_wind_on_the_surface_or_on_all():
-    """On the surface the areas add up to that of the ball; on all they are several times as much."""
     shell = len(SolidScene(**SETTINGS, gaussians="shell").generate())
     surface, everywhere = _scene("throughout"), _scene("throughout", wind_on="all")
     count = len(surface.simulated)
@@ -117,7 +114,6 @@ def test_the_filling_is_neither_drawn_nor_exported(tmp_path):
 
 
 def test_carried_gaussians_follow_gaussians():
-    """Faint ones hang on their nearest Gaussian, not on a point that fills."""
     cloud = SolidScene(**SETTINGS, gaussians="shell").generate()
     opacities = cloud.opacities.clone()
     opacities[::10] = -6.0
@@ -167,7 +163,6 @@ def test_an_open_surface_is_refused():
 
 
 def test_a_run_of_a_filled_solid(tmp_path):
-    """Export and summary; a heavier body moves less than its hollow splat."""
     recorder = {"video": False, "checkpoint_every": 1}
     whole = tmp_path / "whole"
     summary = _simulation().run(whole, 4, progress=False, recorder=Recorder(**recorder))
@@ -186,7 +181,6 @@ def test_a_run_of_a_filled_solid(tmp_path):
 @pytest.mark.gpu
 @in_both
 def test_a_filled_solid_on_a_gpu(formulation):
-    """The kernels take patches of no area; the same run as on the CPU."""
     ends = []
     for device in ("cpu", "cuda"):
         simulation = _simulation(solver={"formulation": formulation}).to(device)
@@ -201,7 +195,6 @@ SMALL += ["--camera.init_args.height", "18", "--material.E", "5e3"]
 
 
 def test_the_pair_of_the_experiment_differs_in_the_wind_alone(tmp_path):
-    """Wind on all Gaussians does more work on the same body."""
     parser, made, work = Simulation.parser(), [], []
     for extra in ([], ["--config", str(ROOT / "configs/sim/variants/solid_all_wind.yaml")]):
         made.append(Simulation.from_settings(parser, parser.parse_args([*SMALL, *extra])))

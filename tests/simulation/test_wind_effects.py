@@ -1,5 +1,3 @@
-"""Winds with effects in a simulation: places in scene units, shelter in every frame, resuming, and the YAML."""
-
 import pytest
 import torch
 from shared import double, waits
@@ -45,7 +43,6 @@ def test_shelter_is_refreshed_in_every_frame(make_simulation):
 
 
 def test_every_effect_can_be_named_in_a_configuration(tmp_path):
-    """By its class name alone; effects are listed with their arguments."""
     effects = [
         "{class_path: Profile, init_args: {height: 3.0}}",
         "{class_path: Profile, init_args: {exponent: 0.2}}",
@@ -67,7 +64,6 @@ def test_every_effect_can_be_named_in_a_configuration(tmp_path):
 
 
 def test_the_next_frame_is_foreseen_in_its_own_shelter(make_simulation):
-    """As it is at its start, and without a change of the shelter that pictures of this frame may still read."""
     simulation = make_simulation()
     simulation.wind = _wind()
     state, _ = simulation.advance(simulation.start())

@@ -1,5 +1,3 @@
-"""The wind in pictures."""
-
 from dataclasses import replace
 
 import imageio.v3 as iio
@@ -19,7 +17,6 @@ from gaussian_swaying.wind.field import WindField
 
 
 def test_streaks_follow_the_wind(make_simulation):
-    """In a uniform wind they are straight, of one length, in its direction, and drift with it."""
     simulation = make_simulation()
     simulation.wind = WindField([3.0, 0.0, 4.0])
     state = simulation.start()
@@ -89,7 +86,6 @@ def test_the_object_hides_what_is_behind_it(make_simulation):
 
 @pytest.mark.parametrize("flow", [[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]])
 def test_a_run_draws_the_wind(make_simulation, tmp_path, flow):
-    """For flows along and across the view, with an obstacle."""
     simulation = make_simulation()
     simulation.wind = WindField(flow, effects=[Obstacle([-1.0, 0.0, 0.4], [0.3] * 3)])
     simulation.run(tmp_path / "run", 1, progress=False, recorder=Recorder(renders=["wind"]))
@@ -106,7 +102,6 @@ def _in_air():
 
 @pytest.mark.parametrize("spin", [20.0, -20.0])
 def test_vorticity_is_red_where_air_turns_against_the_clock(spin):
-    """Air that turns as a whole, seen along its axis: one colour in the box, none outside, and none over the flag."""
     simulation = _in_air()
     stepper, state = simulation.stepper, simulation.start()
     centre = simulation.scene.center.double()

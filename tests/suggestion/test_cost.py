@@ -1,5 +1,3 @@
-"""The estimate of a run's time, against made-up clocks."""
-
 from types import SimpleNamespace
 
 import pytest
@@ -19,7 +17,6 @@ from gaussian_swaying.suggestion.cost import estimate_cost
 
 @pytest.mark.skipif(INTERPRETED, reason="nothing is compiled")
 def test_compiling_is_not_counted(monkeypatch):
-    """It is done once on a machine, and another run finds the kernels."""
     now = [10.0]
     clock = SimpleNamespace(perf_counter=lambda: now[0], process_time=lambda: 0.5 * now[0])
     monkeypatch.setattr(cost_module, "time", clock)
@@ -46,7 +43,6 @@ def test_files_are_written_beside_the_simulation_where_there_are_cores(cores, se
 
 @pytest.mark.parametrize("frames", [1, 2, 101])
 def test_a_run_takes_as_many_substeps_as_it_has_frames_after_the_first(frames, monkeypatch, make_simulation):
-    """Of timed frames the median time of a substep, and the mean number of them."""
     simulation, at_rest = make_simulation(), 10
     taken, each = iter([11, 12, 16]), iter([0.0, 1e-3 * 11, 9e-3 * 12, 2e-3 * 16])
     monkeypatch.setattr(cost_module, "MOST_FRAMES", 3)
@@ -75,7 +71,6 @@ def test_a_cost_is_that_of_its_run(make_simulation):
 
 @pytest.mark.gpu
 def test_kernels_are_loaded_before_a_gpu_is_timed():
-    """They are a part of the start, and not of a frame."""
     pole = PinnedRegion(up_to(x=0.06))
     solver = MPMSolver(0.05, boundaries=[pole], damping=0.2)
     for _ in range(2):

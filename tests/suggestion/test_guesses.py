@@ -41,7 +41,6 @@ def tree(floor=True, offset=5.0):
 
 
 def gaussians(points, normals=None, weight=None):
-    """Points as Gaussians of one weight, or some."""
     points = np.asarray(points, dtype=float)
     one = np.ones(len(points))
     normals = np.tile([0.0, 0, 1], (len(points), 1)) if normals is None else np.asarray(normals)
@@ -184,7 +183,6 @@ def test_flag_has_known_up_pins_region_and_spacing():
 
 
 def test_only_cloth_and_what_falls_has_weight():
-    """All else was captured in balance with its weight."""
     for hold, falls in (("bottom", False), ("top", False), ("none", True)):
         found = guess(tree(), hold=hold)
         assert found.falls == falls
@@ -220,7 +218,6 @@ def test_given_values_replace_guesses():
 
 
 def test_holes_between_large_gaussians_are_filled_without_asking(tmp_path):
-    """A sheet of few, huge Gaussians."""
     cloud = FlagScene(spacing=0.05).generate()
     sparse = dataclasses.replace(cloud, scales=cloud.scales + math.log(4)).select(torch.arange(len(cloud)) % 5 == 0)
     scene = started(dataclasses.replace(guess(sparse), dx=0.06), sparse, tmp_path).scene
@@ -257,14 +254,12 @@ def test_end_region_of_a_tilted_axis_holds_that_end():
 
 
 def ground(low=-0.06, half=1.0, step=0.05, move=(0.0, 0.0, 0.0)):
-    """A level plate of flat Gaussians, as a splat."""
     side = torch.arange(-half, half + step / 2, step)
     means = torch.cartesian_prod(side, side, torch.tensor([low])) + torch.tensor(move)
     return plain_cloud(means, torch.tensor([0.6 * step, 0.6 * step, 0.002]).log(), logit=2.0)
 
 
 def held(cloud):
-    """Where a splat with z up is held, all of it taken as the object."""
     own = Gaussians.of(cloud)
     return guess_hold(own, UP, np.ptp(own.means, axis=0).max() / CELLS)
 

@@ -67,7 +67,6 @@ def test_it_has_the_frequency_and_mass_that_it_announces(bush):
      (lamp, "hanging", "top", (0.5, 1.6), 0.5)],  # slow gusts lead here
 )  # fmt: skip
 def test_its_breeze_sways_it_as_nature_would(make, kind, hold, ratio, peak, tmp_path):
-    """Over ten seconds or ten periods, without the first two: the lean that it announces, and a tree's motion."""
     found, simulation = previewed(make(), tmp_path, hold=hold, kind=kind)
     told = found.natural
     frames = list(simulation.frames(round(max(250, 250 / told.frequency))))
@@ -108,7 +107,6 @@ def test_kind_look_and_speed_are_those_of_the_options(tmp_path):
 
 
 def test_still_air_has_numbers_too(tmp_path):
-    """Mass and drag of the kind, for a wind that is turned on later."""
     found, simulation = previewed(block([0.5, 0.4, 1.0], GREEN, 1500), tmp_path, hold="bottom", wind=0.0)
     told = found.natural
     assert told.lean == 0
@@ -118,7 +116,6 @@ def test_still_air_has_numbers_too(tmp_path):
 
 
 def test_a_cloth_begins_at_a_typical_stretch(tmp_path):
-    """And its numbers are those of fabric, not of a frequency."""
     found, simulation = previewed(FlagScene(spacing=0.1).generate(), tmp_path, hold="-x")
     assert (found.kind, found.natural, found.by_modes) == ("flag", None, False)
     start = simulation.wind.effects[0].start

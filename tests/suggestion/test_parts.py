@@ -47,7 +47,6 @@ def alocasia():
 
 
 def found(cloud, *more, by=finders.potted_plant, up=(0.0, 0.0, 1.0), simulated=None):
-    """The parts that one of the finders finds in all of a splat, or in some Gaussians of it."""
     own, axis = Gaussians.of(cloud), torch.tensor(up).double().numpy()
     simulated = (torch.ones(len(cloud)) if simulated is None else simulated).bool().numpy()
     height = own.means[simulated] @ axis
@@ -93,7 +92,6 @@ def test_the_parts_of_a_plant(alocasia):
 
 
 def test_haze_goes_with_what_it_lies_on(alocasia):
-    """Large and faint above a leaf it moves with it; the same, opaque or out of reach, is something else."""
     leaf = int(alocasia.means[:, 2].argmax())
     haze = alocasia.select(torch.full((3,), leaf))
     means = haze.means + torch.tensor([[0.0, 0.0, 0.1], [0.0, 0.0, 0.1], [0.0, 0.0, 0.4]])

@@ -1,5 +1,3 @@
-"""What cameras tell about a splat: up, the object, a wall or floor behind it."""
-
 import math
 
 import numpy as np
@@ -20,7 +18,6 @@ TILT = TILT * torch.linalg.det(TILT)  # a rotation
 
 
 def cameras(eyes, target=(0.0, 0.0, 0.0), up=(0.0, 0.0, 1.0), roll=0.0, turn=None):
-    """Cameras that look at a point, each rolled about its axis, all of them turned."""
     made = []
     for k, eye in enumerate(eyes):
         camera = look_at_camera(list(eye), list(target), list(up), 50.0, 64, 48, dtype=torch.float64)
@@ -37,13 +34,11 @@ def cameras(eyes, target=(0.0, 0.0, 0.0), up=(0.0, 0.0, 1.0), roll=0.0, turn=Non
 
 
 def ring(count=12, radius=4.0, height=1.0, first=0.0, last=360.0):
-    """Places on an arc about z."""
     angles = [math.radians(first + (last - first) * k / count) for k in range(count)]
     return [(radius * math.cos(a), radius * math.sin(a), height) for a in angles]
 
 
 def write_capture(folder, made):
-    """A transforms.json without images."""
     return write_transforms(folder, made, [f"{k:03d}.png" for k in range(len(made))], images=False)
 
 
@@ -60,7 +55,6 @@ def room():
 
 
 def test_level_photos_tell_up_whatever_their_pitch():
-    """All from one side and from above: the mean of their upward directions leans away, their rows do not."""
     made = cameras(ring(9, 3.0, 3.0, -60, 60))
     up = cameras_up(made)
     assert (up.direction, up.confidence) == ((0, 0, 1), "high")

@@ -1,5 +1,3 @@
-"""The picture of a suggestion, its camera, and its configuration."""
-
 import json
 
 import numpy as np
@@ -41,7 +39,6 @@ POLE = up_to(x=0.11)
 
 
 def column(count=3000, side=0.3, height=2.0):
-    """A square column on the origin, z up."""
     points = torch.rand(count, 3, generator=seeded(0))
     return (points - torch.tensor([0.5, 0.5, 0.0])) * torch.tensor([side, side, height])
 
@@ -94,7 +91,6 @@ def test_orbit_is_left_alone_where_all_of_it_moves():
 
 
 def test_floor_is_not_framed(make_simulation):
-    """A flag over a floor that stays: the picture is that of the flag."""
     flag, side = FlagScene(spacing=0.1).generate(), torch.arange(-3, 3.01, 0.1)
     floor = torch.cartesian_prod(side, side, torch.tensor([-0.1]))
     cloud = together(flag, plain_cloud(floor, torch.tensor([0.08, 0.08, 0.001]).log()))
@@ -108,7 +104,6 @@ def test_floor_is_not_framed(make_simulation):
 
 
 def test_tints_leave_three_tenths_of_the_colour_and_what_is_still_is_pale_and_grey():
-    """Black and white Gaussians: moving, pushed, pinned, both, and not simulated."""
     moving, pushed, pinned = (torch.tensor(row) for row in ([1, 1, 1, 1, 0], [0, 1, 0, 1, 0], [0, 0, 1, 1, 0]))
     none = torch.zeros(5, dtype=torch.bool)
     roles = Roles(simulated=moving.bool(), carried=none, pinned=pinned.bool(), pushed=pushed.bool(), names=[])
@@ -121,7 +116,6 @@ def test_tints_leave_three_tenths_of_the_colour_and_what_is_still_is_pale_and_gr
 
 
 def test_lines_are_where_the_renderer_draws():
-    """The edges of a box, but for those behind the eye."""
     camera = look_at_camera((0.3, -3.0, 0.5), (0, 0, 0), (0, 0, 1), 40.0, 64, 48)
     point = torch.tensor([[0.31, 0.2, -0.17]])
     image = render_torch(point, 1e-6 * torch.eye(3)[None], torch.ones(1), torch.ones(1, 3), camera)
@@ -159,7 +153,6 @@ def test_flow_is_the_strongest_of_a_schedule(make_simulation):
 
 
 def test_picture_shows_pinned_and_static_gaussians(make_simulation):
-    """The flag is white: red where it is held, grey-blue lines apart nothing else."""
     cloud = FlagScene(spacing=0.1, pattern="white").generate()
     camera = LookAtCamera([0.6, -2.5, 0.4], [0.6, 0.0, 0.4])
     picture = preview_picture(make_simulation(cloud=cloud, camera=camera), height=120)

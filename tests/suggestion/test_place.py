@@ -23,7 +23,6 @@ COUNT = 40_000
 
 @pytest.fixture(scope="module")
 def garden():
-    """A place with y down, its Gaussians, and which of them are its plant."""
     cloud, plant = place(COUNT, sh_degree=0)
     return cloud, Gaussians.of(cloud), plant.numpy()
 
@@ -37,7 +36,6 @@ def _mask(members):
 
 
 def _turned(cloud, quat):
-    """Turned about the origin by a quaternion of any length."""
     return turned_cloud(cloud, torch.tensor(quat) / math.hypot(*quat))
 
 
@@ -111,7 +109,6 @@ def test_a_given_direction_is_the_only_one_that_is_tried(garden, up):
 
 @pytest.mark.parametrize("scene", [DemoScene("alocasia", 0.02), FlagScene(spacing=0.03)], ids=["plant", "flag"])
 def test_an_object_is_no_place(scene):
-    """Even on a floor of its own: there is a single thing, and nothing far away."""
     assert survey(Gaussians.of(scene.generate())) is None
 
 

@@ -47,7 +47,6 @@ def test_the_own_frequency_leads_where_it_should():
 
 @pytest.mark.parametrize(("minor", "any_stretch"), [(0.83, False), (0.6, True)])
 def test_both_axes_of_a_round_motion_have_its_frequency(minor, any_stretch):
-    """Where one is nearly as large as the other, either may be the major one in the run."""
     time = np.arange(4000) / 10  # its frequency is 1 Hz; whole periods of 4 s have the same mean in both halves
     early = time < 300  # a later stretch has another mean, which is less of a fault
     slow = np.where(early, np.sin(0.5 * np.pi * time), np.cos(2 * np.pi * time))
@@ -75,7 +74,6 @@ def test_the_motion_is_that_of_an_oscillator():
 
 
 def test_modes_that_share_their_damping_are_those_of_the_matrix():
-    """Two modes with a full damping matrix: the steady motion in a constant load is that of the stiffness alone."""
     square, damping = np.array([4.0, 9.0]), np.array([[0.8, 0.5], [0.3, 1.2]])
     response = stretch._response(square, damping, np.eye(3)[:, :2], math.inf)
     moved, _ = stretch._motion(np.tile([1.0, -2.0], (4000, 1)) @ response.taken, response, 20.0)

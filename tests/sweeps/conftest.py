@@ -1,5 +1,3 @@
-"""Sweeps of tiny flags: as a file, done once without disturbance, and with workers that are killed."""
-
 import multiprocessing
 from functools import partial
 from pathlib import Path
@@ -23,7 +21,6 @@ AXES = {
 
 
 def write_sweep(path, axes=AXES, draws=2, settings=None, **more):
-    """A sweep file of tiny flags; ``settings`` are added to those that make them tiny."""
     fields = {"base": str(FLAG), "settings": SMALL | {"frames": 12} | (settings or {}), "axes": axes, "draws": draws}
     path.write_text(yaml.safe_dump(fields | more, sort_keys=False))
     return path
@@ -37,7 +34,6 @@ def sweep_file():
 
 @pytest.fixture(scope="session")
 def _workers():
-    """Workers that have imported everything: forks of one process, which has not asked for a GPU."""
     if torch.cuda.is_available() or "forkserver" not in multiprocessing.get_all_start_methods():
         yield
         return
@@ -77,7 +73,6 @@ def kill(monkeypatch):
 
 @pytest.fixture(scope="session")
 def undisturbed(tmp_path_factory, _workers):
-    """Folder of the sweep of eight runs."""
     folder = tmp_path_factory.mktemp("sweep")
     file = write_sweep(folder / "tiny.yaml")
     assert main([str(file), "--output", str(folder / "whole"), "--workers", "2", "--device", "cpu"]) == 0

@@ -1,5 +1,3 @@
-"""Axes of a sweep, and the runs that they make."""
-
 import pytest
 from shared import value_error
 

@@ -1,5 +1,3 @@
-"""The table as Parquet, and the runs as WebDataset shards, read back."""
-
 import json
 import shutil
 import tarfile
@@ -81,7 +79,6 @@ def test_shards(undisturbed, tmp_path):
 
 
 def _small_copy(undisturbed, folder):
-    """The record and results of a sweep, without its runs."""
     folder.mkdir()
     shutil.copy(undisturbed / "sweep.json", folder)
     shutil.copytree(undisturbed / "results", folder / "results")

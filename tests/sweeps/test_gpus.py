@@ -25,7 +25,6 @@ def _batch(tmp_path, file):
 
 
 def test_together_is_as_alone(tmp_path, sweep_file):
-    """The kernels with a batch of scenes against one scene after the other, with the same substeps."""
     settings = {"solver.substep": 2e-3, "frames": 5}
     together, members = _batch(tmp_path, sweep_file(tmp_path / "tiny.yaml", settings=settings))
     state = together.start()
@@ -45,7 +44,6 @@ def test_together_is_as_alone(tmp_path, sweep_file):
 
 
 def test_together_foresees(tmp_path, sweep_file):
-    """Without a fixed substep the host waits once in a frame."""
     together, _ = _batch(tmp_path, sweep_file(tmp_path / "tiny.yaml"))
     state, _ = together.advance(together.start())
     assert together.foresees

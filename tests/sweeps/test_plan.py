@@ -1,5 +1,3 @@
-"""Sweep files, and the check of all settings before anything is done."""
-
 from argparse import ArgumentError
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,5 +1,3 @@
-"""Sweeps on Ray: a local cluster of two nodes on one machine."""
-
 import json
 import os
 import signal
@@ -17,7 +15,6 @@ pytestmark = pytest.mark.timeout(900)
 
 @pytest.fixture(scope="module")
 def cluster():
-    """Address of a cluster of two nodes with a core each."""
     from ray.cluster_utils import Cluster
 
     memory = 80 * 2**20
@@ -37,7 +34,6 @@ def test_a_sweep_on_two_nodes(cluster, undisturbed, tmp_path, sweep_file):
 
 
 def test_a_killed_process_and_failures(cluster, tmp_path, sweep_file):
-    """A run whose process is killed is done again; one that fails is tried once more and recorded."""
     axes = {"wind.flow": [[4.0, 1.0, 0.0], [9e3, 0.0, 0.0], [5.0, 1.0, 0.0]]}
     file, folder = sweep_file(tmp_path / "bad.yaml", axes, 1), tmp_path / "out"
     killed = []

@@ -1,5 +1,3 @@
-"""Whole sweeps with worker processes: disturbed ones end as undisturbed ones, and failures stop nothing."""
-
 import errno
 import json
 import os
@@ -140,7 +138,6 @@ def test_a_stopped_sweep_ends_in_order(undisturbed, tmp_path, sweep_file, monkey
 
 
 def test_ctrl_c_of_the_terminal_is_for_the_driver_alone(tmp_path, sweep_file, monkeypatch):
-    """Workers do not hear it, not even while they import."""
     submit = run.Processes.submit
 
     def disturbed(self, job):

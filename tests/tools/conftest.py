@@ -1,5 +1,3 @@
-"""What tests of the tools share."""
-
 import importlib
 import importlib.util
 import sys
@@ -11,7 +9,6 @@ ROOT = Path(__file__).parents[2]
 
 
 def tool_of(path):
-    """A program of the folder tools, as a module."""
     spec = importlib.util.spec_from_file_location(Path(path).stem, ROOT / "tools" / path)
     module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)  # dataclasses look their module up
     spec.loader.exec_module(module)
@@ -20,7 +17,6 @@ def tool_of(path):
 
 @pytest.fixture(scope="module")
 def tool(request):
-    """The program ``TOOL`` of tools/datasets with the modules beside it, which are forgotten afterwards."""
     folder = ROOT / "tools" / "datasets"
     sys.path.insert(0, str(folder))
     try:
@@ -32,8 +28,6 @@ def tool(request):
 
 
 def beside(name):
-    """A fixture: one of the modules beside the tool."""
-
     @pytest.fixture(scope="module")
     def module(tool):
         return sys.modules[name]

@@ -1,5 +1,3 @@
-"""Studies, their records, and the sections of the pages."""
-
 import json
 from pathlib import Path
 
@@ -11,7 +9,6 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture
 def added(monkeypatch):
-    """A study that halves numbers, and fails for zero."""
     monkeypatch.setattr(runner, "STUDIES", {})
 
     @runner.study("halves", lambda device: [{"number": n, "on": device} for n in (0, 2, 3)])

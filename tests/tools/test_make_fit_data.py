@@ -1,5 +1,3 @@
-"""Videos for finding wind and material: cases, cameras, noise, files. Only the last test needs Blender."""
-
 import math
 from dataclasses import replace
 

@@ -43,7 +43,6 @@ def _vertex_areas(grid):
 
 
 def test_every_vertex_stands_for_the_same_share_of_the_cloth(cloth):
-    """The area that a vertex has by its faces is, with the vertex beside it, that of two cells of one size."""
     grid = cloth.Grid.of_cells(1.2, 0.8, 12)
     assert (grid.columns, grid.rows, grid.count) == (11, 7, 96)
     assert grid.cell**2 * grid.count == pytest.approx(1.2 * 0.8)
@@ -129,7 +128,6 @@ def test_motion_is_solved_once_and_says_what_changed(reference, flag_motion, mon
 
 
 def _seen(fields_path, frame, points):
-    """Pixels at which a camera of this package sees points."""
     camera = CaptureCamera(fields_path, frame)(0, 0.0, torch.zeros(3).double(), torch.zeros(3), 1.0)
     local = points @ camera.world_to_camera[:3, :3].T.numpy() + camera.world_to_camera[:3, 3].numpy()
     image = local @ camera.intrinsics.numpy().T
@@ -137,7 +135,6 @@ def _seen(fields_path, frame, points):
 
 
 def test_training_views_hold_the_whole_flag_and_are_ours_too(reference, flag_pictures, tmp_path):
-    """All corners are in every image, at the pixels that the camera in transforms.json gives."""
     pattern = reference.PATTERNS[3]
     views = flag_pictures.sphere_views(pattern, 40, 100)
     path = tmp_path / "transforms.json"

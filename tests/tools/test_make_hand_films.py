@@ -21,7 +21,6 @@ motions = beside("flag_motion")
 
 
 def _moved(tool, motions, name, folder, frames):
-    """A cloth of few cells that is blown by the same way in each frame, as a file."""
     pattern = replace(tool.CLOTHS[name], cells=10, fps=tool.FPS, frames=frames)
     grid = pattern.grid()
     rest = pattern.rest(grid.uv())[0]
@@ -46,7 +45,6 @@ def test_a_row_of_gaussians_lies_on_each_held_edge(tool, name):
 
 
 def test_films_that_begin_before_and_into_the_motion(tool, cases, motions, tmp_path):
-    """The same pictures make both; a fit reads them, and its base holds the cloth and nothing of the room."""
     import imageio.v3 as iio
 
     pictures = 30

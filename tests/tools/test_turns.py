@@ -1,5 +1,3 @@
-"""The comparison of two checkouts."""
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""A flag seen from a few cameras, in memory."""
-
 import lightning
 import pytest
 import torch
@@ -64,7 +62,6 @@ class FlagData(lightning.LightningDataModule):
 
 @pytest.fixture
 def data():
-    """Two small sets of views, for training and validation."""
     return FlagData()
 
 

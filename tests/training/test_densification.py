@@ -1,5 +1,3 @@
-"""The strategies of gsplat on a model, its optimiser and their state."""
-
 import pytest
 import torch
 from shared import seeded, value_error
@@ -67,7 +65,6 @@ def test_copies_splits_and_removes():
 
 
 def test_all_gaussians_at_once():
-    """The layout of a picture that lists every Gaussian, drawn or not."""
     model = _model()
     densification = DefaultDensification(start=0, every=100)
     densification.attach(model, _optimizer(model), 1.0)
@@ -107,10 +104,6 @@ def test_foreign_optimizers_are_refused():
 
 
 def test_large_ones_are_split_once():
-    """At its step: none larger than the size, colours of their own, momenta of what was there, none of what is new.
-
-    From then on none is larger and none turns.
-    """
     model = _model(3, opacity=0.9)
     with torch.no_grad():
         model.scales.copy_(torch.tensor([[0.02, 0.02, 1e-3]]).log().expand(3, 3))

@@ -1,5 +1,3 @@
-"""Gaussians at points."""
-
 import torch
 from torch.testing import assert_close
 

@@ -1,5 +1,3 @@
-"""The terms of the objective against closed forms, another implementation and their derivatives."""
-
 import math
 
 import pytest

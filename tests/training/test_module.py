@@ -1,5 +1,3 @@
-"""Trainings that learn, stop when something is not finite, and continue exactly."""
-
 import math
 
 import lightning
@@ -35,7 +33,6 @@ def _checkpoints(folder, every=10, **options):
 
 
 def _learned(trainer, module, data):
-    """What is validated before and after."""
     start = trainer.validate(module, data, verbose=False)[0]
     trainer.fit(module, data)
     return start, trainer.validate(module, data, verbose=False)[0]
@@ -59,7 +56,6 @@ def test_a_training_learns(data, make_trainer, tmp_path):
 
 
 def _state(module):
-    """Everything that decides how a training goes on."""
     result = {name: getattr(module.splat, name).detach() for name in PARAMETERS}
     (optimizer,) = module.trainer.optimizers
     for name, group in zip(PARAMETERS, optimizer.param_groups, strict=True):
@@ -94,7 +90,6 @@ def test_a_resumed_training_is_the_same_bit_for_bit(data, make_trainer, tmp_path
 
 
 def test_a_checkpoint_with_six_optimizers_is_refused(data, make_trainer, tmp_path):
-    """Those of an earlier version; their splat can still be looked at."""
     path = tmp_path / "step=2.ckpt"
     trainer = make_trainer(2, enable_checkpointing=True, callbacks=[_checkpoints(tmp_path, every=2)])
     trainer.fit(_module(), data)
@@ -128,7 +123,6 @@ class _Heard(lightning.Callback):
 
 
 def test_lightning_counts_images(data, make_trainer, tmp_path):
-    """Its hooks come for each, checkpoints and validations at their numbers, also in a run that goes on."""
     heard = _Heard()
     on = {"enable_checkpointing": True, "limit_val_batches": 1.0, "val_check_interval": 12, "num_sanity_val_steps": 0}
     trainer = make_trainer(33, callbacks=[heard, _checkpoints(tmp_path, every=15)], **on)
@@ -146,7 +140,6 @@ def test_lightning_counts_images(data, make_trainer, tmp_path):
 
 
 def test_data_that_end(data, make_trainer):
-    """A loader of six views, of which an epoch takes up to four."""
     data.train_dataloader = lambda: torch.utils.data.DataLoader(data.train, batch_size=None)
     for options, epoch in (({}, 6), ({"limit_train_batches": 4}, 4)):
         heard = _Heard()
@@ -167,7 +160,6 @@ class _StopAt(lightning.Callback):
 
 
 def test_a_checkpoint_is_evaluated_as_it_was_in_training(data, make_trainer, tmp_path):
-    """With the harmonics that were in use, and panels that bear its step."""
     path, on = tmp_path / "step=10.ckpt", {"limit_val_batches": 1.0, "val_check_interval": 10}
     options = {"sh_every": 6, "panels": 1}
     module = _module(**options)
@@ -201,7 +193,6 @@ class Breaks(LossTerm):
 
 
 def test_a_loss_that_is_not_finite_stops(data, make_trainer, tmp_path):
-    """The step and the last good checkpoint are named; that checkpoint is intact."""
     module = _module(loss_terms={"breaks": Breaks(7)})
     trainer = make_trainer(20, enable_checkpointing=True, callbacks=[_checkpoints(tmp_path, every=3)])
     with pytest.raises(TrainingDiverged, match=r"step 7: the loss is not finite.*step=6\.ckpt") as caught:
@@ -213,7 +204,6 @@ def test_a_loss_that_is_not_finite_stops(data, make_trainer, tmp_path):
 
 
 def test_a_view_without_gaussians(data, make_trainer):
-    """Nothing drawn: the step passes, losses of the Gaussians still count."""
     module = _module()
     cloud = gaussians_from_points(torch.rand(20, 3), torch.rand(20, 3), 1)
     cloud.means.sub_(torch.tensor([0.0, 100.0, 0.0]))  # behind the cameras
@@ -241,7 +231,6 @@ def test_gaussians_that_are_not_finite_are_not_kept(data, make_trainer, tmp_path
 @pytest.mark.gpu
 @pytest.mark.parametrize("kind", ["default", "mcmc"])
 def test_a_training_on_a_gpu(kind, data, make_trainer, tmp_path):
-    """gsplat's kernels, fused optimisers and strategies together; the splat draws on a CPU afterwards."""
     if kind == "mcmc":
         terms = {"opacity": MeanOpacityLoss(), "scale": MeanScaleLoss()}
         options = {"loss_terms": terms, "loss_weights": {"opacity": 0.01, "scale": 0.01}}
@@ -287,7 +276,6 @@ class _Board(lightning.pytorch.loggers.logger.DummyLogger):
 
 
 def test_what_is_shown_on_the_way(data, make_trainer):
-    """Panels on the board, PSNR and the number of Gaussians in the progress bar."""
     board = _Board()
     trainer = make_trainer(4, logger=board, limit_val_batches=1.0, val_check_interval=4)
     trainer.fit(_module(panels=1), data)
@@ -314,7 +302,6 @@ def test_schedules(data, make_trainer):
 
 
 def test_backgrounds(data):
-    """Random behind a photo with alpha in training, fixed in validation; a photo without alpha stays as it is."""
     module = _module(background=[1.0, 0.5, 0.0])
     image = torch.full((2, 2, 3), 0.25)
     alpha = torch.tensor([[1.0, 0.0], [0.5, 0.0]])[..., None]
@@ -333,7 +320,6 @@ def test_backgrounds(data):
 
 
 def test_gaussians_from_a_file(data, make_trainer, tmp_path):
-    """A splat of a higher degree is cut, one of a lower one extended."""
     make_trainer(1).fit(_module(densification=DefaultDensification(stop=0)), data)
     for degree in (0, 2):
         module = _module(init_ply=str(tmp_path / "run/point_cloud.ply"), sh_degree=degree)

@@ -1,5 +1,3 @@
-"""The optimiser of the Gaussians."""
-
 import torch
 
 from gaussian_swaying.training.optimizers import GaussianAdam

@@ -1,5 +1,3 @@
-"""Panels."""
-
 import torch
 from shared import near
 from torch.testing import assert_close
@@ -12,7 +10,6 @@ from gaussian_swaying.training.panels import panel
 
 
 def test_a_panel_shows_four_pictures():
-    """The flag lies in the x-z plane: seen along y its normals point to the camera."""
     model = GaussianSurfaceModel.from_cloud(FlagScene(spacing=0.05, ripple=0.0).generate())
     camera = look_at_camera((0.6, -1.0, 0.4), (0.6, 0.0, 0.4), (0.0, 0.0, 1.0), 30.0, 40, 30)
     photo = torch.rand(30, 40, 3)

@@ -1,5 +1,3 @@
-"""Training on several devices: the images are shared, the gradients averaged, and there is one splat."""
-
 import os
 import socket
 import subprocess
@@ -118,7 +116,6 @@ def _free_port():
 
 
 def test_two_processes_stay_alike(data, tmp_path):
-    """Gaussians that multiply by the images of both, and are the same on both."""
     cloud = data.initial_cloud(1)
     _start(_fit, data.train.views, cloud, tmp_path, _free_port())
     one, two = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))

@@ -1,5 +1,3 @@
-"""Which folder a training takes, and when."""
-
 from pathlib import Path
 from types import SimpleNamespace
 

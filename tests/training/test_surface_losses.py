@@ -1,5 +1,3 @@
-"""Losses of the surface on views whose surface is known."""
-
 import math
 from dataclasses import replace
 from functools import cache
@@ -104,7 +102,6 @@ def _seeded(term, inputs):
 
 
 def test_round_trips_end_where_they_began_on_the_true_surface_and_elsewhere_off_it():
-    """Off by h along the view, a point comes back beside itself by about f h tan(angle) / z."""
     camera, other = _camera(0.6), _camera(0.9)
     beside = OtherView(_photo(0.9, 0.4), other, _plane(other))
     pixel = double([[96.0, 96.0], [90.3, 102.1]])
@@ -305,7 +302,6 @@ def _train(data, make_trainer, terms):
 
 
 def test_a_training_with_all_terms(data, make_trainer):
-    """Each is logged once it has begun, and moves the Gaussians."""
     module, logged = _train(data, make_trainer, TERMS)
     begun = [{name for name in TERMS if f"train/{name}" in row} for row in logged if "train/loss" in row]
     assert begun[:4] == [set(), set(), {"surface"}, set(TERMS)]

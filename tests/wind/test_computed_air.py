@@ -1,5 +1,3 @@
-"""Computed air around a sheet: momentum, energy, masses, what it costs, and what is refused."""
-
 import math
 
 import pytest
@@ -37,14 +35,12 @@ def _simulation(air=None, wind=(3.0, 0.5, 0.0), hold=True, density=100.0, dtype=
 
 
 def _started(**changes):
-    """A simulation at its start: stepper, state, and the moments of its air."""
     stepper = _simulation(**changes).stepper
     state = stepper.start()
     return stepper, state, state.air.clone()
 
 
 def _together(stepper, state, now, substeps=4):
-    """A step of the body without one of the air: the state then, and what its points took."""
     air, dt = stepper.air, stepper.air.flow.units.dt / substeps
     whole = [state] if air.settings.force == "law" else []
     (place,) = air._begin(now, substeps, dt, state.position, state.velocity, *whole)
@@ -76,7 +72,6 @@ def test_a_free_sheet_gets_the_momentum_that_the_air_loses(dtype):
 
 
 def test_still_air_takes_energy_and_gives_none():
-    """A sheet that is bent and let go, held at its pole."""
     stepper, state, _ = _started(wind=(0.0, 0.0, 0.0))
     velocity, nodes = torch.zeros_like(state.velocity), torch.zeros_like(state.node_velocity)
     velocity[:, 1] = 2.0 * (state.position[:, 0] + 0.6)
@@ -113,7 +108,6 @@ def test_any_ratio_of_masses_ends_finite(ratio):
 @pytest.mark.gpu
 @pytest.mark.parametrize("force", ["surface", "law"])
 def test_recorded_steps_are_those_that_are_not(force, monkeypatch):
-    """From the second frame on all steps replay graphs; their sums are in any order, as atomic ones are."""
     _, replayed, _ = _run(_simulation(device="cuda", force=force), 4)
     monkeypatch.setattr(Replayed, "__call__", lambda self, key, function, *inputs: list(function(*inputs)))
     _, plain, _ = _run(_simulation(device="cuda", force=force), 4)
@@ -124,7 +118,6 @@ def test_recorded_steps_are_those_that_are_not(force, monkeypatch):
 
 
 def test_the_law_acts_in_the_air_at_the_patches():
-    """With ``force: law`` the air loses what the patches get, and less of it than with a surface that stops it."""
     lost = {}
     for force in ("law", "surface"):
         stepper, state, now = _started(force=force, wind=(0.5, 3.0, 0.0))
@@ -147,7 +140,6 @@ def test_a_heavy_surface_stops_its_layer_of_air_however_short_the_substeps():
 
 
 def test_the_law_is_no_stronger_than_what_stops_the_surface():
-    """Its force is cut off at the given rate times the difference of velocities, and is its own below that."""
     stepper, state, _ = _started(force="law", wind=(0.5, 3.0, 0.0), dtype="float64")
     air = double([0.5, 3.0, 0.0]).expand_as(state.velocity)
     free, rate = stepper.air._law(state, air, torch.full(air.shape[:1], 1e9, dtype=torch.float64))
@@ -160,7 +152,6 @@ def test_the_law_is_no_stronger_than_what_stops_the_surface():
 
 
 def test_the_inflow_has_the_wind_of_the_end_of_the_frame():
-    """Of a wind that doubles in the frame and grows with the height; the rest at a face is what lets sound leave."""
     keys = [FlowKey(0.0, [2.0, 0.0, 0.0]), FlowKey(0.02, [4.0, 0.0, 0.0])]
     profile = Profile([0.0, 0.0, -1.2], height=2.0, roughness=0.05)
     wind = WindField(schedule=keys, interpolation="linear", effects=[profile])
@@ -255,6 +246,5 @@ def test_what_cannot_be_right_is_refused(changes, message):
 
 
 def test_a_wind_that_is_not_there_costs_nothing():
-    """The default coefficients of the wind's force do not act beside computed air."""
     assert not any(type(force).__name__ == "WindForce" for force in _simulation().stepper.forces)
     assert AeroForce().air_density > 0

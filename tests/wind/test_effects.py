@@ -1,5 +1,3 @@
-"""Profiles, plumes, flow round bodies and shelter, against closed forms and measurements."""
-
 import math
 import re
 from importlib import import_module
@@ -149,12 +147,10 @@ plane_wake = on_tensors(effects.plane_wake)
 
 
 def round_wake(behind, aside, width, drag):
-    """The wake of a body with a drag below one."""
     return on_tensors(effects.round_wake)(behind, aside, width, drag, wake_start(drag))
 
 
 def carlson_rd(x, y, z):
-    """Carlson's integral in double precision."""
     return on_tensors(effects.carlson_rd)(x, y, z, 9)
 
 
@@ -164,12 +160,10 @@ def around(obstacle, flow, place):
 
 
 def cylinder(axis, radius):
-    """A cylinder through the origin."""
     return changed(Obstacle([0.0] * 3, [None, radius, radius], drag=0.0), axes=[axis.tolist()] * 3)
 
 
 def ellipsoid(radii):
-    """An ellipsoid at the origin."""
     return Obstacle([0.0] * 3, list(radii), drag=0.0)
 
 
@@ -185,7 +179,6 @@ def _directions(count=40):
 
 
 def _surface(name):
-    """Points of a surface just outside of it, and its normals."""
     direction = _directions()
     if name == "ellipsoid":
         x = direction * double(RADII)
@@ -196,7 +189,6 @@ def _surface(name):
 
 @pytest.mark.parametrize("name", FLOWS)
 def test_the_flow_is_a_potential_one_round_the_body(name):
-    """Neither divergence nor rotation, nothing through the surface, the wind far away and still air inside."""
     flow = FLOWS[name]
     place = 1.5 * _directions() * torch.linspace(1, 3, 40, dtype=torch.float64)[:, None]
     slope = torch.func.vmap(torch.func.jacrev(lambda x: flow(x[None])[0]))(place)
@@ -375,7 +367,6 @@ def _slab(depth, drag, direction, cells=32):
 
 
 def _speed(load, state, *place):
-    """Speed of the wind at a place, once it has been sheltered anew."""
     load.refresh(state)
     return float(load.wind.at(state.time, double([place]))[0].norm())
 

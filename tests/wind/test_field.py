@@ -1,5 +1,3 @@
-"""The wind is a function of time and seed, and its statistics are what they say."""
-
 import math
 from copy import deepcopy
 
@@ -81,7 +79,6 @@ def test_winds_of_several_scenes_together(winds):
 
 
 def test_the_kernel_modulates_as_torch_does(kernel_device):
-    """Also of several scenes, and after its numbers were changed."""
     times = torch.cat([torch.linspace(-0.2, 3, 90), torch.tensor([0.05, 0.1, 0.5, 1.3, 1e4])]).double()
     for wind in (_gusty(2), WindField.together([_gusty(k) for k in range(1, 4)]), _scheduled(2, "linear")):
         moved, expected = deepcopy(wind).to(kernel_device), wind(times)
@@ -172,7 +169,6 @@ def _read(gust, dt, seconds=INTERVALS * T, seed=11, flow=None):
 
 
 def _gusts(gust, dt, **more):
-    """The same without the mean flow that was set, first component."""
     return (_read(gust, dt, **more) - double(GUSTS[gust][1]))[:, 0]
 
 
@@ -202,14 +198,12 @@ def test_autocovariance_is_a_triangle_as_wide_as_the_interval(gust, dt):
 
 
 def _uncorrelated(a, b):
-    """Both standardised, one value for each interval."""
     assert len(a) == INTERVALS
     product = (a - a.mean()) * (b - b.mean()) / (a.std() * b.std())
     return abs(float(product.mean())) < FOUR
 
 
 def test_components_are_independent():
-    """Not only uncorrelated: neither are their squares."""
     values = _read("gaussian", T) - double([2.0, -1.0, 0.5])
     for i, j in ((0, 1), (0, 2), (1, 2)):
         assert _uncorrelated(values[:, i], values[:, j])

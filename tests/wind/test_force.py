@@ -1,5 +1,3 @@
-"""The wind law against its closed forms and symmetries."""
-
 import math
 
 import pytest
@@ -139,7 +137,6 @@ def test_gradcheck(law):
     ("law", "speed", "part"), [("paper", 0.0, "C_D"), ("paper", 0.0, "C_F"), ("linear", 5.0, "C_D")]
 )
 def test_the_rate_is_the_slope_of_the_force(law, speed, part):
-    """Across the flow, or along it; a patch that is faster is slowed, and ``linear`` resists by all of its slope."""
     coefficients = {"C_D": 0.0, "C_F": 0.0, "C_L": 0.0, part: 0.7}
     aero = AeroForce(**coefficients, air_density=RHO, law=law, drag_step="semi_implicit")
     wind, area = _vector(3, 0, 0), _vector(0.2)

@@ -1,5 +1,3 @@
-"""The wind on groups of patches equals the sum over their patches."""
-
 import math
 
 import pytest
@@ -36,20 +34,17 @@ def random_patches(spread, each=30, seed=0):
 
 
 def each_patch(wind, velocity, F, normal, area, point, cap=math.inf, **law):
-    """The definition: the force of ``aero_force`` on every patch, summed."""
     now, grown = deform_patch(F[point], normal, area)
     force = aero_force(wind, velocity[point], now, torch.minimum(grown, cap * area), **law)
     return torch.zeros_like(velocity).index_add(0, point, force)
 
 
 def grouped_force(wind, velocity, F, patches, drag, friction, lift, law, cap=None):
-    """Force on groups of patches, and their area."""
     aero = AeroForce(drag, friction, C_L=lift, law=law, max_area_ratio=cap)
     return aero.on_patches(wind, velocity, F, patches)
 
 
 def off(found, expected):
-    """Difference of forces, over their size."""
     return float((found - expected).norm(dim=-1).sum() / expected.norm(dim=-1).sum())
 
 
@@ -59,7 +54,6 @@ def winds(count=60):
 
 
 def turned(stretch=0.0):
-    """Rotations of the points, with some stretch."""
     generator = seeded(2)
     quats = randn(POINTS, 4, generator=generator)
     strain = stretch * randn(POINTS, 3, 3, generator=generator)

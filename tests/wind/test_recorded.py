@@ -48,7 +48,6 @@ def test_a_recorded_wind_is_exact_where_it_is_linear(tmp_path):
 
 
 def test_a_recorded_wind_repeats(tmp_path):
-    """After the last time the first follows, after a mean step."""
     effect = RecordedWind(_npz(tmp_path / "w.npz"), repeat=True, start=6.0)
     wind = WindField(effects=[effect])
     place = double([[0.3, 0.2, 1.7]])
@@ -150,7 +149,6 @@ def test_without_netcdf4_a_file_that_scipy_cannot_read_names_the_extra(tmp_path,
 
 
 def test_a_frozen_box(tmp_path):
-    """As hipersim writes it: x along the wind, y to its left."""
     axes = {name: step * np.arange(n) for name, n, step in (("x", 16, 2.0), ("y", 8, 3.0), ("z", 4, 4.0))}
     velocity = np.random.default_rng(0).normal(size=(16, 8, 4, 3))
     np.savez(tmp_path / "box.npz", velocity=velocity, **axes)
@@ -204,7 +202,6 @@ BAD_FIELDS = {
 
 
 def test_headers_of_turbsim(tmp_path):
-    """Each file is as long as its header says, but the last two. The smallest has one row of two places, two times."""
     path = tmp_path / "w.bts"
 
     def write(more=0, **changes):

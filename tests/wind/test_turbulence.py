@@ -63,7 +63,6 @@ def _waves(cells=CELLS, spacing=H):
 
 @pytest.fixture(scope="module")
 def measured():
-    """Means over the seeds: variances, spectrum along x, and its cross spectrum with the field ``j`` cells aside."""
     variance, spectrum, cross = 0, 0, {j: 0 for j in (1, 2, 4)}
     for seed in range(SEEDS):
         box = turbulence_box(CELLS, [H] * 3, L, seed=seed).double()
@@ -79,7 +78,6 @@ def measured():
 
 @pytest.mark.parametrize("spectrum", ["von_karman", "kaimal"])
 def test_spectra_agree_with_each_other(spectrum):
-    """Their integrals, and that of the energy of all waves longer along x than a given one."""
     k = torch.logspace(-7, 7, 100001, dtype=torch.float64)
     energy = energy_spectrum(k, 2.0, spectrum)
     assert float(torch.trapezoid(energy, k)) == pytest.approx(1.5, rel=1e-4)  # k^(-5/3) beyond 1e7: 2e-5
@@ -110,7 +108,6 @@ def test_variance_is_that_of_the_waves_of_the_box(measured):
 
 
 def test_spectra_are_von_karmans(measured):
-    """Means over bands; up to an eighth of the smallest wave the waves left out across the wind do not matter."""
     (k1, *_), share = _waves()
     exact = share.sum((1, 2)) / (k1[1] - k1[0])
     for first, last in ((1, 4), (4, 8), (8, 16), (16, 32), (32, 60)):
@@ -184,7 +181,6 @@ def test_coherence_falls_with_the_distance_as_von_karmans():
 
 @pytest.mark.parametrize("gamma", [0.0, 3.9])
 def test_there_is_no_divergence(gamma):
-    """Relative to the gradient, in the waves of the box."""
     box = turbulence_box((32, 16, 24), [0.25, 0.5, 0.3], L, gamma=gamma, seed=3).double()
     shape, steps = box.shape[:3], (0.25, 0.5, 0.3)
     k = torch.meshgrid(
@@ -225,7 +221,6 @@ def test_look_ups_are_exact_for_a_linear_field():
 
 @pytest.mark.parametrize("wraps", [True, False])
 def test_places_that_are_no_numbers_stay_in_the_table(wraps):
-    """A diverged simulation is reported as such, and does not end with an index out of range."""
     table = torch.ones(4, 5, 6, 3)
     place = torch.tensor([[float("nan"), 1.0, 1.0], [float("inf"), 1.0, 1.0], [1e30, -1e30, 1.0]])
     found = looked_up(table, place, wraps)
@@ -247,7 +242,6 @@ def test_shear_has_the_variances_of_the_standard():
 
 
 def test_shear_makes_gusts_down_the_wind_and_stress():
-    """A long box holds most of the variances, and slow air is that which rises."""
     length, found = 1.0, 0
     for seed in range(4):
         box = turbulence_box((512, 32, 32), [0.5] * 3, length, gamma=3.9, seed=seed).double().flatten(0, 2)
@@ -425,7 +419,6 @@ def test_a_simulation_takes_a_look_by_its_name(make_simulation):
 
 
 def test_a_start_is_a_later_time():
-    """The air has come the start's way: U t."""
     flow, places = [6.0, 2.0, 0.0], randn(20, 3, generator=seeded(0))
     plain = WindField(flow, effects=[Turbulence(0.3, 1.5)])
     later = WindField(flow, effects=[Turbulence(0.3, 1.5, start=[7.0 * c for c in flow])])
@@ -446,7 +439,6 @@ def _theirs(mann, cells, spacing, gamma, seed):
 
 
 def _measures(box):
-    """Variances, spectra in three bands, and coherence at two distances in two bands, of the component along x."""
     wave = torch.fft.rfft(box, dim=0)
     power = wave.abs().square().mean((1, 2))
     bands = ((1, 3), (3, 8), (8, 20))

@@ -32,7 +32,6 @@ ZERO = double(0.0)
 
 
 def _setting(wind=GUSTS, batch=(), formulation="total", transfer="torch", like=ZERO, groups=False, **aero):
-    """A solver, a state that has moved a little, and the load; two patches on each particle with ``groups``."""
     draw = seeded(0)
     position, velocity, area = (
         make(*batch, 20, n, dtype=torch.float64, generator=draw).to(like)
@@ -52,7 +51,6 @@ def _setting(wind=GUSTS, batch=(), formulation="total", transfer="torch", like=Z
 
 
 def test_winds_are_those_of_the_start_of_each_substep():
-    """One wind for all scenes, or one for each."""
     time = double(0.01)
     times = time + DT * torch.arange(5)
     winds = _setting()[2].winds(time, DT, 5)
@@ -116,7 +114,6 @@ def test_gradients_reach_the_patches_and_the_coefficients():
 
 @pytest.mark.parametrize("name", ["area", "normal", "C_D", "flows"])
 def test_what_asks_for_a_gradient_is_not_left_to_the_kernels(name, monkeypatch):
-    """The rollout as a whole is asked about it, before any substep."""
     solver, state, load = _setting(WindField([3.0, 0.0, 0.0]))
     owner = {"C_D": load.aero, "flows": load.wind}.get(name, load)
     getattr(owner, name).requires_grad_()
@@ -149,7 +146,6 @@ class Whirl(SpatialWind):
 
 
 def _blown(winds, turn, shift, delay):
-    """The wind at five points of two copies, and its force."""
     turns = torch.stack([turned_by(0.0), turn])
     places = torch.nn.Module()
     vars(places).update(turn=turns, shift=double([[0.0] * 3, shift]), delay=double([0.0, delay]))
@@ -193,7 +189,6 @@ def test_a_force_in_many_winds():
 
 @pytest.mark.parametrize("batch", [(), (2,)])
 def test_a_wind_with_effects_is_asked_where_the_particles_are(batch):
-    """For all substeps at once or one by one; a batch takes winds with and without."""
     effects = [Profile([0.0, 0.0, -1.0], height=2.0, exponent=0.14), Turbulence(0.3, 0.2, cells=[16, 8, 8])]
     shaped = WindField([3.0, 1.0, 0.0], modulations=[UniformGust(0.5, interval=4 * DT)], effects=effects)
     _, state, load = _setting([shaped, GUSTS] if batch else shaped, batch)
@@ -253,7 +248,6 @@ def _recorded():
 
 
 def _wind(name):
-    """A wind of its own for every test, as it is moved to a device."""
     low = {"ground": [0.0, 0.0, 0.05], "height": 0.2}
     gusts = [UniformGust(0.5, interval=2 * DT)]
     turbulence = Turbulence(0.5, 0.1, cells=[8, 6, 4], spacing=0.03)
@@ -275,7 +269,6 @@ def _wind(name):
 
 
 def _pair(device, make, formulation="total", **options):
-    """The solver with kernels and that in torch, a state, and the load of a wind that a function makes."""
     options |= {"formulation": formulation, "like": torch.zeros((), device=device)}
     solver, state, load = _setting(make(), transfer="kernels", **options)
     return solver, _setting(make(), **options)[0], state, load
@@ -318,7 +311,6 @@ def test_the_kernels_blow_as_torch_does(kernel_device, formulation, name, option
 
 
 def test_a_changed_effect_is_read_again_at_the_same_address(kernel_device):
-    """A table changed in place, another flow, and rollouts that are replayed from graphs on a GPU."""
     solver, reference, state, load = _pair(kernel_device, lambda: _wind("half"))
     ends, where = [], None
     for change in range(4):
@@ -340,7 +332,6 @@ def _packed(load, device):
 
 
 def test_only_what_has_changed_is_written_again(kernel_device, monkeypatch):
-    """A shelter is refreshed in every frame; the turbulence before it has fifty megabytes in its full size."""
     _, state, load = _setting(_wind("sheltered"), like=torch.zeros((), device=kernel_device))
     written, tables = [], _packed(load, kernel_device)
     plain = torch.Tensor.copy_
@@ -390,8 +381,6 @@ def test_the_host_reads_nothing_of_a_wind():
 
 
 def test_what_the_kernels_do_not_know_runs_in_torch():
-    """A subclass does not inherit the device function, nor does a wind have one without those of all effects."""
-
     class Doubled(Profile):
         def forward(self, velocity, position, moment):
             return 2 * super().forward(velocity, position, moment)

@@ -155,7 +155,6 @@ def _comb(thickness: float, gap: float, how: str, settings: Settings, **more: An
 
 
 def _single_layer(hold: str, settings: Settings) -> Row:
-    """A strip of one layer, and how far one that is thicker than a cell differs from it."""
     options = {"hold": hold, "shift": 0.3, "layers": 1}
     thin = strips.hinged_strip(8, settings, **options)
     thick = strips.hinged_strip(8, settings, slenderness=6, sag=0.001, **options)
@@ -178,7 +177,6 @@ def _slopes(settings: Settings) -> Row:
 
 
 def _spread(cells: int, duration: float) -> Row:
-    """A column of sand beside a lower and a weaker one."""
     each = ((1.0, 30.0), (2 / 3, 30.0), (1.0, 20.0))
     tall, low, weak = (column_collapse(a, cells=cells, friction_angle=f, duration=duration) for a, f in each)
     return tall | {"lower": low["runout"] / tall["runout"], "weaker": weak["runout"] / tall["runout"]}

@@ -41,7 +41,6 @@ SECTIONS["materials.known"] = _materials
 
 
 def _live() -> str:
-    """Without those of classes that are not the package's, which tests define."""
     kinds = {"vector": "three numbers", "whole": "a whole number"}
     gusts = (kind.live for kind in Modulation.__subclasses__() if kind.__module__.startswith("gaussian_swaying"))
     swaying = {f"wind.modulations.*.{field}" for live in gusts for field in live}

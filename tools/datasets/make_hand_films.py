@@ -296,7 +296,6 @@ def write_film(thing: Thing, case: Path, folder: Path, video: FitVideo, view: Vi
 
 
 def _seen(thing: Thing, video: FitVideo, view: View) -> GaussianCloud:
-    """The part of the room in front of the camera as Gaussians."""
     cloud = splat(thing.room, thing.size, thing.spacing, video.light, video.ambient)
     camera = camera_of(view)
     pixels, depth = project(cloud.means.double(), camera)

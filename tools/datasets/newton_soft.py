@@ -147,7 +147,6 @@ def solve_block(
 
 
 def _model(newton: Any, warp: Any, block: Block, gravity: float) -> tuple[Any, np.ndarray]:
-    """The model, and the triangles of its skin."""
     mu, lam = newton_moduli(block.youngs_modulus, block.poisson_ratio)
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, -gravity))
     across, along, up = block.counts

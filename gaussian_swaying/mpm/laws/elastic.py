@@ -141,7 +141,6 @@ def _length_slope(square):
 
 @triton.jit
 def _length_difference(x, y):
-    """Divided difference, accurate to round-off also if x is close to y."""
     low = LOG_FLOOR * LOG_FLOOR
     share = share_above(x, y, low)
     return share / (tl.sqrt(tl.maximum(x, low)) + tl.sqrt(tl.maximum(y, low))) + 0.5 * (1 - share) / LOG_FLOOR

@@ -191,20 +191,16 @@ class DeviceLaw:
 
     @cached_property
     def free(self) -> bool:
-        """Whether the energy needs neither numbers of the law nor an internal variable."""
         used = uses(self.energy, _STRETCHED) if self.energy else uses(self.strain_energy, _STRAINED)
         return not used & {"internal", "p"}
 
     @cached_property
     def density(self) -> Any:
-        """Energy density from F."""
         return self.strain_energy or _spectral_energy(self.energy)
 
 
 @cache
 def _derivative(energy: Any, by: str) -> Any:
-    """The derivative of an energy density by ``a`` or ``F``."""
-
     def formula(x: Any, *rest: Any) -> Any:
         return gradient([on_tensors(energy)(x, *rest)], x)
 
@@ -215,8 +211,6 @@ def _derivative(energy: Any, by: str) -> Any:
 
 @cache
 def _hessian(energy: Any) -> Any:
-    """H_ii, and H_ij, twist and flip of each pair, from the stretches."""
-
     def formula(a: Any, *rest: Any) -> Any:
         y = gradient([on_tensors(energy)(a, *rest)], a)
         rows = [gradient([slope], a) for slope in y]
@@ -314,7 +308,6 @@ class ConstitutiveLaw(Fixed, nn.Module, ABC):
         return ()
 
     def _run(self, name: str, x: Any, mu: Any, lam: Any, internal: Any, *more: Any) -> Any:
-        """Run a device function on tensors."""
         if self.formulas is None:
             raise NotImplementedError(f"{type(self).__name__} needs `device`, or energy, pk1 and moduli of tensors")
         if internal is None:

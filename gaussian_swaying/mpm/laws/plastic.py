@@ -47,7 +47,6 @@ def _stretch_of_log(x):
 
 @triton.jit
 def _drawn_back(trace, d, direction, flow):
-    """Stretches after a flow along the deviator."""
     mean = trace / 3
     d = add3(d, -flow, direction)
     return _stretch_of_log(d[0] + mean), _stretch_of_log(d[1] + mean), _stretch_of_log(d[2] + mean)

@@ -44,9 +44,6 @@ def write_film(run: Path, target: Path) -> Film:
     Args:
         run: The output folder of ``gaussian-swaying sim``.
         target: The file; its name ends in .html for a page, or in .sway for the film alone (docs/bundle.md).
-
-    Returns:
-        The film.
     """
     bundle = target.suffix == ".sway"
     if not bundle:
@@ -98,7 +95,7 @@ def page(film: Film) -> str:
 
 
 def write_player(folder: Path) -> list[Path]:
-    """Write to a folder what plays .sway files elsewhere, and return the files.
+    """Write the programs that play .sway files elsewhere, and return the files.
 
     These are ``sway.js`` for scenes of three.js and Spark, ``sway-playcanvas.js`` for those of PlayCanvas, and
     ``gaussian-swaying.js`` with the element
@@ -131,10 +128,9 @@ HINTS = {
 
 
 def filled(kind: str, head: dict[str, Any], blocks: dict[str, bytes]) -> str:
-    """A page.
+    """An HTML page: the player with its data.
 
     Args:
-        kind: One of :data:`STARTS`.
         head: The head of a film, of which title and background are put in.
         blocks: What the page unpacks, by name, in the order in which it is needed.
     """
@@ -158,13 +154,13 @@ def filled(kind: str, head: dict[str, Any], blocks: dict[str, bytes]) -> str:
 
 
 def message(head: dict[str, Any], *blocks: bytes) -> bytes:
-    """A message for a page: the length of its head (uint32, little-endian), the head in JSON, and its bytes."""
+    """A message for a page: length of the head (uint32, little-endian), head in JSON, then the bytes."""
     text = json.dumps(head, allow_nan=False).encode()
     return b"".join([len(text).to_bytes(4, "little"), text, *blocks])
 
 
 def in_steps(displacement: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Displacements as whole numbers of steps, and those of nodes that swing too far for 16 bits.
+    """Quantise displacements to 16-bit steps; nodes that swing too far are stored apart.
 
     A node at the border of a body has almost no mass, and may swing by thousands of times its size.
 
@@ -191,7 +187,7 @@ def of_steps(near: np.ndarray, far: np.ndarray, step: float) -> np.ndarray:
 
 
 def parts_of(head: dict[str, Any]) -> list[list[Any]]:
-    """The parts of the file, each as its kind and the first and last (excluded) of its Gaussians or frames.
+    """The order of the parts of a file: kind, and first and last (excluded) of its Gaussians or frames.
 
     The first parts, ``head["start"]`` of them, are enough for a first picture: some of all Gaussians, and some frames.
     Then frames, Gaussians that move and others follow in turn, so that the film plays while it is read.
@@ -242,12 +238,9 @@ def pack_head(film: Film, parts: list[list[Any]]) -> dict[str, bytes]:
 
 
 def pack_splats(film: Film, moving: bool, first: int = 0, last: int | None = None) -> bytes:
-    """Some of the Gaussians of a film that move, or of the others, as the page reads them.
+    """Moving or static Gaussians of a film, as the page reads them.
 
     Args:
-        film: The film.
-        moving: Which of the two.
-        first: The first of them.
         last: The last (excluded); all if None.
     """
     count = film.head["moving"]
@@ -302,14 +295,14 @@ def unpack(blocks: dict[str, bytes]) -> Film:
 
 
 def folded(values: np.ndarray) -> np.ndarray:
-    """Numbers of 16 bits with the sign in the last one, so that small ones have a first byte of zero, uint16."""
+    """16-bit numbers with the sign moved to the last bit, so that small ones have a zero first byte, uint16."""
     bits = values.view(np.uint16)
     found: np.ndarray = bits << 1 ^ -(bits >> 15)
     return found
 
 
 def planes(values: np.ndarray) -> bytes:
-    """The first bytes of all numbers, then the second bytes, and so on."""
+    """Bytes regrouped by significance: the first bytes of all numbers, then the second bytes, and so on."""
     little = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
     return little.reshape(-1).view(np.uint8).reshape(-1, values.itemsize).T.tobytes()
 

@@ -59,7 +59,7 @@ class Film:
         facing: Unit normals of those that move in steps of 1/32767, and 32767 for Gaussians of a solid, int16, shape
             (L, 4).
         color: Red, green, blue and opacity in steps of 1/255, uint8, shape (N, 4).
-        growth: How much each grows while others are missing (:func:`growth`), in steps of 1/255, uint8, shape (N, 1).
+        growth: Inflation factor while streaming is incomplete (:func:`growth`), in steps of 1/255, uint8, shape (N, 1).
         order: The index of each in the splat, int64, shape (N,); the file does not have it.
         stencils: The nodes of each stencil, as rows of ``displacement``, uint32, shape (S, 27).
         displacement: Displacement of the nodes [m], float32, shape (K, M, 3).
@@ -89,9 +89,6 @@ class Film:
 
     def moved(self, frame: int) -> tuple[Tensor, Tensor]:
         """Centres and covariances in a frame, as the page draws them, without a limit of stretch.
-
-        Args:
-            frame: Its number.
 
         Returns:
             Centres, float64, shape (N, 3), and covariances, shape (N, 3, 3).
@@ -129,7 +126,7 @@ def read_film(run: Path) -> Film:
 
 
 def film_without_frames(simulation: Simulation, state: Any, name: str) -> Film:
-    """The Gaussians of a simulation at rest and the nodes that move them; its state has a grid."""
+    """The Gaussians of a simulation at rest, with the nodes that move them."""
     nodes = simulation.scene.follow.nodes(state)
     assert nodes is not None  # the solver is `total` or `modes`
     return film_of(simulation, state.grid, nodes, torch.zeros(0, len(nodes), 3), name)
@@ -139,11 +136,8 @@ def film_of(simulation: Simulation, grid: GridSpec, nodes: Tensor, displacement:
     """The film of a simulation whose nodes move.
 
     Args:
-        simulation: The simulation.
-        grid: Its grid.
         nodes: Flat indices of the nodes in the grid, rising, shape (M,).
         displacement: Their displacements [m], float32, shape (K, M, 3).
-        name: What it shows.
     """
     scene, painter = simulation.scene, simulation.painter
     camera = painter.camera_at(0)
@@ -220,16 +214,12 @@ BLOCK = 16  # pixels
 
 
 def growth(scene: SimulatedScene, camera: Camera) -> Tensor:
-    """The growth of each Gaussian in a picture of a part of them, from 0 to 1, shape (N,).
+    """Inflation factor of each Gaussian in a partly loaded film, from 0 to 1, shape (N,).
 
     Of N Gaussians, n cover as much as all if each is s = sqrt(N / n) times as large. Where many lie one behind the
     other, as in haze or in a hedge, less is enough, and the picture is drawn much faster: each becomes max(1, s g)
     times as large, where g is the root of :data:`LAYERS` per optical depth, and at most 1. The optical depth is the sum
     of the integrals of what is centred in a block of pixels, per area of the block.
-
-    Args:
-        scene: The scene, at rest.
-        camera: The first view, on the device of the scene.
     """
     means, scales = scene.model.means.detach(), in_double(scene.model.scales.detach())
     seen = means @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
@@ -258,7 +248,7 @@ _EVERY_THIRD_BIT = (
 
 
 def spread(position: Tensor, first: int = 1) -> Tensor:
-    """An order of places (N, 3) in which the first ones are spread over all of them, as indices (N,).
+    """An order (N,) of places (N, 3) whose first ones are spread over all of them.
 
     Places are sorted along a Z-order curve and taken in the order of van der Corput's sequence: the second lies in the
     middle, the third in the middle of the first half, and so on. Those of a part, of which the first one has a length,
@@ -291,17 +281,15 @@ def look_of(painter: Painter) -> dict[str, Any]:
 
 
 def stencils_of(stencil: Stencil, grid: GridSpec, nodes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The places at which the motion is read, and their stencils, for a browser.
+    """Places at which the motion is read, and their stencils, for a browser.
 
     Args:
-        stencil: Of the places.
-        grid: The grid.
         nodes: Flat indices of the nodes that are known, rising, shape (M,).
 
     Returns:
-        The places in cells of the grid from its first node, float64, shape (N, 3); rounding of arms leaves each in the
-        cell of its stencil, where it is ``floor(place - 0.5)``. The number of the stencil of each, shape (N,), and the
-        rows of the 27 nodes of each stencil in ``nodes``, shape (S, 27).
+        The places in cells from the first node of the grid, float64, shape (N, 3), nudged so that rounding does not
+            move them out of the cell ``floor(place - 0.5)`` of their stencil; the stencil of each, shape (N,); and the
+            27 nodes of each stencil, as rows of ``nodes``, shape (S, 27).
     """
     number = torch.unique(stencil.cell, return_inverse=True)[1]
     count = int(number.max()) + 1 if len(number) else 0
@@ -323,7 +311,7 @@ def _steps(values: Tensor, grain: int = 1) -> np.ndarray:
 
 
 def first_view(simulation: Simulation) -> dict[str, Any]:
-    """The first camera of a run: eye, point on its axis nearest to the object, field of view [degrees]; and a metre."""
+    """The first camera (eye, target, vertical field of view [degrees], aspect), and a metre in sizes of the object."""
     scene, camera = simulation.scene, simulation.painter.camera_at(0)
     size = scene.size * scene.frame.metres_per_unit
     eye = scene.frame.point_to_sim(in_double(camera.position)) / size

@@ -31,11 +31,7 @@ from gaussian_swaying.wind.tables import CarriedField
 
 
 def check(simulation: Simulation) -> None:
-    """Check that a browser can simulate this.
-
-    Args:
-        simulation: The simulation, not started.
-    """
+    """Check that a browser can simulate this."""
     solver, model = simulation.solver, simulation.model
     if not isinstance(solver, MPMSolver):
         raise _refused("`custom_solver`", "leave it out")
@@ -135,7 +131,6 @@ def pack_solver(simulation: Simulation, nodes: Tensor) -> bytes:
 
 
 def _shapes(bound: Modes, nodes: Tensor) -> dict[str, Tensor]:
-    """The shapes of the modes on the sites and on some nodes, in small whole numbers."""
     omega = bound.square.sqrt()
     every = [bound._everywhere(x.unflatten(-2, (-1, 3)).flatten(-2))[nodes] for x in (bound.shape, bound.turn)]
     shown = torch.cat([x.reshape(-1, len(omega)) for x in every])

@@ -23,7 +23,7 @@ TOUCHING = 2.0
 
 
 def load_of(simulation: Simulation) -> float:
-    """Material points times substeps in a second of a simulation at rest [1/s], in those of WebAssembly."""
+    """Cost of a simulation at rest: points times substeps per second [1/s], in those of WebAssembly."""
     surface = simulation.scene.surface_places
     slower = SWAYING if simulation.solver.formulation == "modes" else 1.0
     slower *= TOUCHING if surface is not None and surface.contact is not None else 1.0
@@ -32,16 +32,7 @@ def load_of(simulation: Simulation) -> float:
 
 
 def fitted(parser: ArgumentParser, settings: Namespace, target: str) -> tuple[Simulation, str]:
-    """Choose the points and the grid for a kind of machine.
-
-    Args:
-        parser: From :meth:`Simulation.parser`.
-        settings: The settings as they are configured.
-        target: One of :data:`TARGETS`.
-
-    Returns:
-        The simulation, and what was chosen in words.
-    """
+    """Choose points and grid for a kind of machine."""
     configured, budget = float(settings.solver.dx), TARGETS[target]
     made: dict[float, Simulation] = {}
 

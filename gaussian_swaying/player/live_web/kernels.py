@@ -50,9 +50,7 @@ def pack_total(bound: Total, forces: Sequence[Force], wind: WindField) -> tuple[
     """What a page needs to run ``total``: the head of its block, and arrays.
 
     Args:
-        bound: The body at rest, on a CPU.
         forces: The forces, of which the wind is the first if it does something; all have device functions.
-        wind: The wind.
     """
     functions = _functions(forces)
     with narrowed(wasm.LANES), at_home(bound.node_mass):
@@ -105,10 +103,7 @@ def pack_modes(
     """What a page needs to run ``modes``, as :func:`pack_total`; it fills the tables ``sites`` and ``nodes`` itself.
 
     Args:
-        bound: The body.
-        wind_force: The wind on its sites; None if it does nothing.
-        wind: The wind.
-        nodes: Number of the nodes that it shows.
+        wind_force: The wind on the sites; None without wind.
     """
     count, sites = bound.square.shape[-1], bound.sites
     functions = _functions([] if wind_force is None else [wind_force])
@@ -209,7 +204,7 @@ def _functions(forces: Sequence[Force]) -> list[DeviceFunction]:
 
 
 def blown(wind: WindField) -> tuple[Passes, dict[str, Tensor]]:
-    """The kernel of the wind at :data:`MOST_STEPS` times, and its tables: times, velocities, numbers of the gusts."""
+    """The kernel that samples the wind at :data:`MOST_STEPS` times, with its tables: times, velocities, gusts."""
     times = torch.zeros(MOST_STEPS, dtype=torch.float64)
     with noted() as blow:
         air = wind(times)
@@ -220,7 +215,6 @@ def blown(wind: WindField) -> tuple[Passes, dict[str, Tensor]]:
 
 
 def _substeps(run: TotalRun, free: dict[str, Any], held: dict[str, Any]) -> Passes:
-    """A substep without a pull and one with it."""
     passes: Passes = {}
     for name, options in {"free": free, "held": held}.items():
         with noted() as passes[name]:
@@ -229,7 +223,6 @@ def _substeps(run: TotalRun, free: dict[str, Any], held: dict[str, Any]) -> Pass
 
 
 def _seen(run: TotalRun, looks: Looks) -> Passes:
-    """What reads the points, and what measures the waves."""
     material = run.material
     with noted() as read:
         run._look_at()
@@ -241,7 +234,6 @@ def _seen(run: TotalRun, looks: Looks) -> Passes:
 
 
 def _looks(run: TotalRun, fastest: Tensor) -> Looks:
-    """The waves to measure: function, material and place of the largest speed, and that of the largest stretch."""
     looks = []
     for k, law in enumerate(run.bound.points.laws):
         material = run.material.clone()
@@ -256,7 +248,6 @@ def _packed(
     passes: Passes, tables: dict[str, Tensor], loads: Packed, layouts: Sequence[Composed], wind: WindField,
     others: Passes | None = None,
 ) -> tuple[dict[str, Any], dict[str, Tensor], Callable[[int], int]]:  # fmt: skip
-    """The head and the arrays of some kernels, and the place of an address; ``layouts`` without a pull and with it."""
     free, held = layouts
     carried, packed, past, small = [], [], [], {}
     tables["winds"] = loads.rows

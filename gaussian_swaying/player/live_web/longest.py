@@ -14,12 +14,9 @@ MARGIN = 0.8
 
 
 def longest_courant(bound: Total) -> float:
-    """Courant number of :data:`MARGIN` times the largest stable substep of a scene at rest, without its pins.
+    """Courant number of :data:`MARGIN` times the largest stable substep at rest, without pins.
 
     Pins only lower frequencies.
-
-    Args:
-        bound: The body on its grid.
     """
     cells = float(wave_speed(bound.points).max()) / bound.settings.dx
     fastest = (fastest_vibration(bound) ** 2 + float(bound.bending_rate)) ** 0.5
@@ -31,9 +28,6 @@ def fastest_vibration(bound: Total) -> float:
 
     Its square is the largest eigenvalue of M⁻¹ K, with lumped masses M and the stiffness K of linear elasticity, which
     all laws have at rest (Lanczos' method, within 1 %).
-
-    Args:
-        bound: The body on its grid.
     """
     from scipy.sparse.linalg import LinearOperator, eigsh
 

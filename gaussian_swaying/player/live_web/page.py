@@ -20,16 +20,7 @@ PAGE = Path(__file__).parent / "page"
 
 
 def write_live_web(simulation: Simulation, name: str, target: Path) -> Film:
-    """Write a simulation as one .html file that runs in a browser.
-
-    Args:
-        simulation: The simulation; it is started.
-        name: What it shows.
-        target: The file; its name ends in .html.
-
-    Returns:
-        The Gaussians, in a film without frames.
-    """
+    """Write a simulation as one .html file that runs in a browser."""
     check_page(target, "page")
     check(simulation)
     state, wind = simulation.start(), simulation.wind

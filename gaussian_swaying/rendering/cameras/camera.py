@@ -18,7 +18,7 @@ NEAR = 0.01
 
 
 def counted_pose(world_to_camera: Tensor, origin: Origin) -> Tensor:
-    """The same pose (4, 4), float64, for places that count from an origin."""
+    """The pose (4, 4), float64, relative to another origin."""
     moved = world_to_camera.clone()
     moved[:3, 3] += moved[:3, :3] @ torch.tensor(origin, dtype=moved.dtype)
     return moved
@@ -145,9 +145,6 @@ def look_at_camera(
         near: Near plane [scene units]; :data:`NEAR` of the distance when None.
         dtype: Precision of the matrices; the default precision of torch when None.
 
-    Returns:
-        The camera.
-
     Example:
         >>> look_at_camera((0, -2, 0), (0, 0, 0), (0, 0, 1), 40.0, 480, 270).position[1]
         tensor(-2.)
@@ -209,9 +206,6 @@ def orbit_camera(
         height: Image height [pixels].
         near: Near plane [scene units]; :data:`NEAR` of the distance when None.
         dtype: Precision of the matrices; the default precision of torch when None.
-
-    Returns:
-        The camera.
     """
     check_positive("radius", radius)
     check_elevation("elevation_degrees", elevation_degrees)
@@ -266,7 +260,7 @@ def project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 def azimuth_beside(flow: Sequence[float]) -> float | None:
-    """Azimuth [degrees] from which a flow [m/s, z up] goes to the right of the picture; None if it is not level."""
+    """Azimuth [degrees] from which a flow [m/s, z up] goes to the right; None if the flow is not level."""
     x, y, z = flow
     level = math.hypot(x, y)
     return math.degrees(math.atan2(-x, y)) if level > abs(z) else None

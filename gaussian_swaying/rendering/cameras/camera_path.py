@@ -38,7 +38,7 @@ class CameraPath(Fixed, ABC):
     _origin: Origin = NO_ORIGIN
 
     def counted_from(self, origin: Origin) -> CameraPath:
-        """The path for a splat whose places count from a point of its file; another one if its places are in a file."""
+        """The path for a splat whose origin was taken off; converted if its places come from a file."""
         if not self.captured or origin == self._origin:
             return self
         path = replace(self)  # type: ignore[type-var]
@@ -88,7 +88,7 @@ class PinholePath(CameraPath):
         check_picture(self)
 
     def picture(self, like: Tensor, fov_y: float | None = None) -> dict[str, Any]:
-        """Lens, size, device and type (those of a tensor) for :func:`look_at_camera` and :func:`orbit_camera`."""
+        """Keyword arguments (lens, size, device, dtype) of :func:`look_at_camera` and :func:`orbit_camera`."""
         lens = {"fov_y_degrees": fov_y or self.fov_y, "width": self.width, "height": self.height}
         return {**lens, "device": like.device, "dtype": like.dtype}
 

@@ -24,9 +24,6 @@ def interpolate_keys(times: Sequence[float], values: Sequence[Sequence[float]], 
         times: Increasing times [s], K of them.
         time: Time [s].
 
-    Returns:
-        D numbers.
-
     Example:
         >>> interpolate_keys([0.0, 2.0], [[0.0], [8.0]], 0.5)
         [1.25]
@@ -47,7 +44,6 @@ def interpolate_keys(times: Sequence[float], values: Sequence[Sequence[float]], 
 
 
 def _slope(times: Sequence[float], values: Sequence[float], k: int) -> float:
-    """Slope of the interpolant at a key: weighted harmonic mean of the slopes on both sides, zero at an extremum."""
     if not 0 < k < len(times) - 1:
         return 0.0
     left, right = times[k] - times[k - 1], times[k + 1] - times[k]
@@ -136,7 +132,6 @@ _ANGLES = ("azimuth", "elevation", "radius")
 
 
 def _filled(values: list[Any], first: Any) -> list[Any]:
-    """Each value, or the last one given before it, or ``first``."""
     filled = []
     for value in values:
         first = first if value is None else value

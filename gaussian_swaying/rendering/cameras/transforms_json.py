@@ -39,10 +39,6 @@ def camera_of_transforms(
             the one that keeps the file's aspect ratio when only ``height`` is given.
         height: Height of the image to render [pixels], with the same defaults.
         near: Near plane [scene units].
-        origin: Point of the file from which places count.
-
-    Returns:
-        The camera, in the default precision of torch.
     """
     where = f"`{path}`"
     pixels = read_intrinsics(where, {**data, **data["frames"][frame]}, width, height)

@@ -56,13 +56,11 @@ class TrainingImage:
         return straight_colors(self.pixels)[1]
 
     def __getitem__(self, name: str) -> Any:
-        """Field or property with this name."""
         if name not in ("image", "alpha", "pixels", "camera", "name", "index"):
             raise KeyError(name)
         return getattr(self, name)
 
     def get(self, name: str, default: Any = None) -> Any:
-        """Field or property with this name, or ``default`` if there is none."""
         try:
             return self[name]
         except KeyError:
@@ -105,7 +103,6 @@ class CaptureDataset(Dataset[TrainingImage]):
         return len(self.views)
 
     def __getitem__(self, index: int) -> TrainingImage:
-        """The view of an index."""
         view = self.views[index]
         pixels = view.load() if self._pixels is None else self._pixels[index]
         return TrainingImage(pixels, view.camera, view.name, index, self._cameras[index])
@@ -335,7 +332,6 @@ class EndlessShuffle(Sampler[int]):
         self.count, self.seed, self.start, self.every = count, seed, start, every
 
     def __iter__(self) -> Iterator[int]:
-        """Indices from ``start`` on."""
         return islice(self._all(), 0, None, self.every)
 
     def _all(self) -> Iterator[int]:

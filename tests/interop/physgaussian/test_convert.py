@@ -1,5 +1,3 @@
-"""PhysGaussian's configurations against what its code does with them."""
-
 import json
 import math
 import re
@@ -191,7 +189,6 @@ def _parts(config, tmp_path):
 
 
 def _one(condition, tmp_path, **more):
-    """The boundaries that one condition becomes, made."""
     return list(_parts({**BASE, **more, "boundary_conditions": [condition]}, tmp_path).solver.boundaries)
 
 
@@ -209,7 +206,6 @@ def _of_bar(config, tmp_path, *arguments, points=None):
 
 
 def _normalised(points, rotation, scale):
-    """PhysGaussian's preprocessing, written out."""
     turned = points @ rotation.T
     low, high = turned.amin(0), turned.amax(0)
     return (turned - 0.5 * (low + high)) * scale / (high - low).amax() + 1.0
@@ -320,7 +316,6 @@ ROTATIONS = [([], []), ([135.0], [0]), ([45.0, 6.5], [1, 2]), ([30.0, -5.0], [2,
 
 
 def test_rotations_follow_one_another():
-    """About y, then about z, as matrices written out."""
     a, b = math.radians(45.0), math.radians(6.5)
     y = [[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]]
     z = [[math.cos(b), -math.sin(b), 0], [math.sin(b), math.cos(b), 0], [0, 0, 1]]
@@ -344,7 +339,6 @@ def test_the_frame_is_physgaussians_preprocessing(degrees, axes):
 
 @pytest.mark.parametrize(("degrees", "axes"), ROTATIONS)
 def test_boxes_mean_the_particles_that_physgaussian_selects(degrees, axes, tmp_path):
-    """Area, material, pin and turning cylinder of a scene that is not aligned with its axes."""
     generator = seeded(3)
     rotation = rotation_matrix(degrees, axes)
     points = 3 * rand(3000, 3, generator=generator) - 1.5
@@ -421,7 +415,6 @@ def _turned(place, center, normal, rotation_scale, translation_scale):
 
 
 def test_what_holds_nothing_says_where_the_splat_is_in_its_own_axes(tmp_path):
-    """The region of the scene in the turned axes, a material and a pin in the normalised space."""
     rotation = rotation_matrix([135.0], [0])
     far = {"point": [9, 9, 9], "size": [0.1, 0.1, 0.1]}
     place = _normalised(_bar(), rotation, 1.0)
@@ -652,7 +645,6 @@ def test_a_missing_gravity_is_refused():
 
 
 def test_parts_of_the_splat_work_with_a_converted_configuration(tmp_path):
-    """Boundaries are in the normalised space, parts are of Gaussians."""
     cloud = FlagScene(spacing=0.06).generate()
     label = torch.bucketize(cloud.means[:, 0].contiguous(), torch.tensor([0.2, 0.8]))
     roles = [Part("pole", "held"), Part("cloth"), Part("board", "rigid", density=300.0)]
@@ -680,7 +672,6 @@ def test_parts_of_the_splat_work_with_a_converted_configuration(tmp_path):
 
 
 def test_the_command_writes_what_sim_reads(tmp_path, capsys):
-    """To a file or to the standard output, the same; bad input leaves nothing behind."""
     config, output = tmp_path / "wolf.json", tmp_path / "wolf.yaml"
     config.write_text(json.dumps(PUBLISHED["wolf"]))
     assert convert_main([str(config)]) == 0

@@ -25,12 +25,10 @@ def run_for(
 
 
 def lone(places):
-    """Particles without neighbours: stencils do not overlap."""
     return solid(double(places), 1e-3, E=1e3)
 
 
 def march(solver, points, dt, steps, velocity=None, frame=None):
-    """All states from the first to the last, on a grid that is large enough."""
     states = [solver.init_state(points, velocity, margin=12, frame=frame)]
     for _ in range(steps):
         states.append(solver.step(states[-1], dt))

@@ -1,5 +1,3 @@
-"""Each boundary acts only where and when it should."""
-
 import copy
 import dataclasses
 import math
@@ -48,7 +46,6 @@ def _made(name, region=UPPER):
 
 
 def _acting(name, device, dtype=torch.float64):
-    """A condition in the metres of some frame, and the velocities and nodes that it acts on."""
     generator = seeded(3)
     position = rand(200, 3, generator=generator) * 0.6 - 0.1
     frame = SimFrame.fit(position, up=(0.2, 1.0, 0.3), metres_per_unit=2.0)
@@ -113,7 +110,6 @@ def test_separate_lets_go_of_what_moves_away_and_slip_does_not(formulation, wall
 
 @pytest.mark.parametrize("name", ACTING)
 def test_a_substep_may_be_a_tensor_and_constants_are_made_once(name, monkeypatch):
-    """And it acts until its end alone; the solver ends a release, and a rigid body never ends."""
     for dtype, tolerance in ((torch.float32, 1e-6), (torch.float64, 1e-12)):
         boundary, velocity, nodes = _acting(name, "cpu", dtype)
         known = boundary(velocity, nodes)
@@ -142,7 +138,6 @@ def test_a_substep_may_be_a_tensor_and_constants_are_made_once(name, monkeypatch
 @pytest.mark.parametrize("name", ACTING)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_recorded_condition_follows_time_and_substep(name, dtype):
-    """One CUDA graph for any time and any substep; nothing in it waits for the host or copies from it."""
     boundary, velocity, nodes = _acting(name, "cuda", dtype)
     nodes = dataclasses.replace(nodes, dt=torch.full_like(nodes.time, 1e-3))
     stream = torch.cuda.Stream()
@@ -171,7 +166,6 @@ def test_a_recorded_condition_follows_time_and_substep(name, dtype):
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "still"])  # which is in metres
 def test_in_frame_leaves_the_original_alone(name):
-    """A second frame, or a dtype change of the original, does not change the copy in metres either."""
     scene = block().position
     frame = SimFrame.fit(scene, up=(0.0, 1.0, 0.0), metres_per_unit=3.0)
     boundary, region = _made(name), UPPER
@@ -240,7 +234,6 @@ def test_region_that_holds_nothing_names_its_condition(name, framed):
 
 
 def test_share_that_no_node_reaches_names_its_condition():
-    """One particle among many at a node: it holds less than the share."""
     pin = changed(BOUNDARIES["PinnedRegion"](Sphere([0.2333, 0.2333, 0.2333], 0.03), kind="nodes"), pinned_share=0.9)
     with value_error(r"no grid node.*enlarge `region` of the PinnedRegion"):
         MPMSolver(0.4, boundaries=[pin]).init_state(block())
@@ -307,7 +300,6 @@ def test_an_obstacle_stops_the_nodes_on_and_in_it_in_its_time(time, acts):
 
 @pytest.mark.parametrize("path", [None, KeyedPath([0.0, 1.0], moves=[[0, 0, 0], [1, 2, 3]])])
 def test_a_mesh_in_a_frame_is_as_far_as_in_the_scene(path):
-    """Turned, moved, and three metres per unit."""
     turn = double([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     frame = SimFrame(double([0.3, -0.1, 0.2]), turn, 3.0)
     mesh = OBSTACLES["mesh"](path=path)
@@ -377,7 +369,6 @@ def test_block_slides_down_an_incline_with_coulombs_acceleration(formulation):
 
 @in_both
 def test_velocity_box_drives_only_its_side(formulation):
-    """Two lone particles on either side of a face: the nodes inside are driven, the others are not."""
     points = lone([[0.0, 0.0, 0.05], [0.0, 0.0, -0.25]])
     drive = VelocityBox(Box([-9, -9, -0.05], [9, 9, 9]), [0.5, 0.0, -0.3], start=0.02, end=0.05)
     ends = march(MPMSolver(0.1, formulation, gravity=(0, 0, 0), boundaries=[drive]), points, 0.01, 8)
@@ -388,7 +379,6 @@ def test_velocity_box_drives_only_its_side(formulation):
 
 
 def test_a_travelling_box_takes_its_nodes_from_where_it_is():
-    """It moves from its start on, in the metres of a frame that scales and rotates."""
     frame = SimFrame.fit(block().position, up=(0.0, 1.0, 0.0), metres_per_unit=0.5)
     box = Box([0.0, 0.0, 0.0], [0.2, 0.4, 0.4])
     drift = frame.direction_to_sim(double([1.0, 0.0, 0.0]))

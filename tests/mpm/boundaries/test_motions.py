@@ -103,7 +103,6 @@ def test_handle_without_any_motion_is_a_pin(formulation):
 
 @in_both
 def test_scenes_of_a_batch_have_their_own_impulse_and_front(formulation):
-    """The impulse is on each scene; a scene without a particle in it gets none. Each front starts at its scene."""
     one = lone([[0, 0, 0], [1, 0, 0], [2, 0, 0]])
     shifts = double([[0, 0, 0], [3, 0, 0], [0, 0, 1]])
     position = torch.stack([k * one.position + shift for k, shift in zip((1, 2, 1), shifts, strict=True)])
@@ -168,7 +167,6 @@ def test_release_of_a_single_layer_is_at_its_start():
 
 @pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0)])
 def test_release_between_given_points(up):
-    """The front meets them at its start and end, in any frame, and independently of the other particles."""
     scene = double([[-1.0, 5, 0], [0.5, 0, 1], [1.0, 2, 9], [2.0, 0, 0], [3.5, 0, 0]])
     frame = SimFrame.fit(scene, up=up, metres_per_unit=0.5)
     release = PinnedRegion(Sphere([0, 0, 0], 99.0), front=[[0, 0, 0], [2, 0, 0]], start=1.0, end=3.0).in_frame(frame)
@@ -194,7 +192,6 @@ def test_an_impulse_does_not_move_what_is_pinned(formulation):
     ("dt", "start", "end"), [(1e-3, 0.0105, 0.0382), (3e-3, 0.0105, 0.0382), (2e-3, 0.0123, 0.0124)]
 )
 def test_impulse_arrives_whole_whatever_the_substep(formulation, dt, start, end):
-    """In proportion to the time gone by within the window; substeps across its ends get their part, or all of it."""
     points = block(per_side=4)
     impulse = double([0.3, -0.2, 0.5])
     knock = Impulse(beyond(z=0.2), impulse.tolist(), start, end)
@@ -234,7 +231,6 @@ def test_impulse_pushes_by_mass_and_only_its_region(formulation):
 
 @in_both
 def test_impulse_per_particle_grows_with_their_number(formulation):
-    """It also grows with the number in each scene of a batch, for any mass; counted again for another material."""
     knock = Impulse(beyond(z=0.2), [0.01, -0.02, 0.03], end=2e-3, per_particle=True)
     solver = MPMSolver(0.1, formulation, boundaries=[knock], gravity=ZERO)
     impulse = double([0.01, -0.02, 0.03])

@@ -1,5 +1,3 @@
-"""Pins hold points, faces or nodes: where, which bodies, in which windows, with which impulses and gradients."""
-
 import dataclasses
 import math
 import warnings
@@ -61,7 +59,6 @@ def _sheet(dtype=torch.float64, layers=1, width=8, height=10, turn=0.0, shift=(0
 
 
 def _read(place, state, name="node_velocity"):
-    """Values and slopes of a nodal field at rest places, by the transfers of the solver."""
     field = getattr(state, name)
     return gather(field, bspline_stencil(torch.as_tensor(place, dtype=field.dtype), state.grid, False))
 
@@ -89,12 +86,10 @@ def _started(points, *boundaries, **settings):
 
 
 def _rows(solver):
-    """Those of the first phase and scene."""
     return pinning.Rows(*(field[0, 0] for field in solver.bound.pinned_rows.rows))
 
 
 def _own_places(solver):
-    """The values among the rows."""
     rows = _rows(solver)
     return rows.place[~rows.slope]
 
@@ -110,7 +105,6 @@ AT = [[0.013, 0.0, -0.001], [0.31, 0.0, -0.017], [0.2, 0.0, -0.3]]  # which need
 @pytest.mark.parametrize("kind", ["hinge", "clamp"])
 @pytest.mark.parametrize("layers", [1, 3])
 def test_held_points_stay_where_they_are(kind, dtype, most, layers):
-    """Those of a region, and places."""
     points = _sheet(dtype, layers)
     for pin, across in ((PinnedRegion(TOP, kind), 1), *([] if layers == 3 else [(PinnedPoints(AT, kind), slice(3))])):
         solver = MPMSolver(DX, boundaries=[pin])
@@ -209,7 +203,6 @@ def test_places_are_converted_from_scene_units():
 
 
 def _condition(holds):
-    """The largest condition number of the normalised products of the kept rows, over phases and scenes."""
     worst = 1.0
     for w in holds.W.flatten(0, 1):
         w = w[: int((w.diagonal() != 0).sum())]
@@ -223,7 +216,6 @@ def _condition(holds):
 @pytest.mark.parametrize("patch", [1, 2, 8])
 @pytest.mark.parametrize(("kind", "most"), [("hinge", 50.0), ("clamp", 1000.0)])
 def test_kept_rows_are_independent_at_any_angle(kind, most, patch):
-    """Lines and patches, in one layer and in three. What is left out hardly moves: it depends on what is kept."""
     generator = seeded(patch)
     worst = 0.0
     for k in range(8):
@@ -326,7 +318,6 @@ def test_a_pin_that_opens_lets_go():
 
 
 def test_pins_act_within_their_windows():
-    """One from the start, one for some time, one that starts later: three phases and two releases."""
     points = _sheet()
     dt = 1e-3
     pins = [
@@ -373,7 +364,6 @@ def test_points_are_released_one_by_one():
 @pytest.mark.parametrize("hundreds", [5, 40])
 @pytest.mark.parametrize("kind", ["hinge", "clamp"])
 def test_the_longest_proven_substep_stays_stable(kind, hundreds):
-    """The projection adds no stiffness: energy stays bounded over thousands of substeps."""
     points = _sheet(layers=3, e=1e5)
     solver = MPMSolver(DX, boundaries=[PinnedRegion(TOP, kind)], gravity=ZERO)
     generator = seeded(2)
@@ -555,7 +545,6 @@ def test_only_what_has_a_target_moves():
     ],
 )
 def test_a_cell_beside_a_place_has_all_the_nodes_that_it_needs(place, massless, first):
-    """Along each axis in turn; the place lies at the middle of a cell along the other two."""
     grid = GridSpec(0.5, (-1, 2, 0), (7, 6, 8))
     for axis in range(3):
         node = double([3.0] * 3)
@@ -684,7 +673,6 @@ def test_a_hinge_that_holds_several_lines_is_warned_of(rows, wide, shift):
 
 
 def test_held_material_is_soft_and_takes_its_weight():
-    """The stiffness of what is clamped for good is not needed; the pin carries the weight of the whole."""
     rest = _box(8, 1, 2)
     points = _material(rest)
     solver = MPMSolver(DX, boundaries=[PinnedRegion(up_to(x=0.4))])

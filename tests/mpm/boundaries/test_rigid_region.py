@@ -137,7 +137,6 @@ def test_scenes_of_a_batch_do_not_know_each_other():
 
 @in_both
 def test_it_has_gradients(formulation):
-    """Of the height of the body by the stiffness of what it hangs on, against a difference."""
     pin = PinnedRegion(up_to(x=0.1), "nodes")
 
     def height(E):
@@ -233,7 +232,6 @@ def test_in_total_a_part_falls_on_the_ground_and_rests_there():
 
 
 def test_in_updated_parts_may_meet():
-    """Each keeps its shape; the grid between them passes momentum on."""
     left = up_to(x=0.2)
     points, solver = bar(RigidRegion(left), RigidRegion(RIGHT), formulation="updated", gravity=ZERO)
     velocity = torch.where(right(points)[:, None], double([-1.0, 0.0, 0.0]), 0.0)

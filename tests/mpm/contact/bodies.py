@@ -11,7 +11,6 @@ DX = 2.2 * SPACING
 
 
 def sheet(nx, ny, low=(0.0, 0.0, 0.0), dtype=torch.float64, spacing=SPACING, axes=(0, 1), E=2e4):
-    """A flat sheet of nx times ny points from a corner on, along two axes."""
     place = torch.zeros(nx * ny, 3, dtype=dtype)
     x, y = (torch.arange(n, dtype=dtype) * spacing for n in (nx, ny))
     place[:, axes[0]], place[:, axes[1]] = x.repeat_interleave(ny), y.repeat(nx)
@@ -24,7 +23,6 @@ def _surface(points, contact, normal=(0.0, 0.0, 1.0), spacing=SPACING):
 
 
 def scene(points, contact=None, boundaries=(), velocity=None, normal=(0.0, 0.0, 1.0), **settings):
-    """A solver in `total` with its contact, and the first state."""
     settings = {"dx": DX} | settings
     solver = MPMSolver(boundaries=boundaries, **settings)
     return solver, solver.init_state(points, velocity, surface=_surface(points, contact, normal))
@@ -46,7 +44,6 @@ def layers(count, gap, side=6, shift=0.0, boundaries=(), change=None, dtype=torc
 
 
 def march(solver, state, seconds, frame=0.01):
-    """The states at the end of some frames."""
     states = []
     for _ in range(round(seconds / frame)):
         steps = solver.substeps(state, frame)

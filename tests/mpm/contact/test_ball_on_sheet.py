@@ -30,7 +30,6 @@ def _ball():
 
 
 def _drop(friction=0.3, **settings):
-    """The solver, its first state, and the triangles of both and of the ball, among the places that touch."""
     x = torch.arange(SIDE).double() * SPACING
     sheet = torch.cat([torch.cartesian_prod(x, x), torch.zeros(SIDE * SIDE, 1).double()], dim=-1)
     inner, out = _ball()
@@ -65,7 +64,6 @@ def _drop(friction=0.3, **settings):
 
 
 def _passed(place, triangles):
-    """Crossings of the sheet with the ball and with itself; the rings at the poles of the ball are too fine."""
     whole, ball = triangles
     return crossings(place, whole) - crossings(place, ball)
 

@@ -1,5 +1,3 @@
-"""Sheets that touch each other and themselves: nothing passes through, momentum stays, piles rest."""
-
 from dataclasses import replace
 
 import pytest
@@ -19,7 +17,6 @@ GROUND = [0.0, 0.0, -0.005], [0.0, 0.0, 1.0]
 
 
 def _two(speed, angle=0.0, dtype=torch.float64):
-    """A sheet that flies onto a larger one, and the triangles of both."""
     below, above = sheet(16, 16, dtype=dtype), sheet(10, 10, (0.053, 0.047, 0.13), dtype=dtype)
     points = MaterialPoints.join([below, above])
     velocity = torch.zeros_like(points.position)
@@ -51,7 +48,6 @@ def test_sheets_that_collide_do_not_pass_each_other(speed, friction):
 
 
 def test_without_contact_they_do_pass():
-    """The same collision without contact: the test above can fail."""
     points, velocity, triangles = _two(2.0)
     solver, state = scene(points, None, velocity=velocity, gravity=ZERO)
     assert solver.bound.contact is None  # off costs nothing
@@ -93,7 +89,6 @@ def test_layers_pressed_together_stay_in_order(count):
 
 
 def _rest(count, seconds, dtype=torch.float64):
-    """Changes of the energy and of its elastic part after a pile has settled; how far a layer rises or sinks."""
     settings = {"gravity": (0, 0, -9.8), "stiffness_damping": 1e-3, "boundaries": [Obstacle(HalfSpace(*GROUND))]}
     solver, state = layers(count, THICKNESS, side=5, shift=0.003, dtype=dtype, **settings)
     settled = march(solver, state, 0.5, frame=0.1)[-1]
@@ -131,7 +126,6 @@ def test_a_pile_rests_for_long(dtype, seconds):
 
 
 def test_the_lists_do_not_change_the_result(monkeypatch):
-    """Lists that were made for sheets at rest are noticed when the sheets fly: the rollout is made again."""
     points, velocity, _ = _two(2.0, 0.3)
     solver, state = scene(points, Contact(), velocity=velocity, gravity=ZERO)
     still = state.replace(velocity=0 * velocity, node_velocity=0 * state.node_velocity)
@@ -174,7 +168,6 @@ def test_contact_needs_normals_and_fixed_neighbours():
 
 
 def test_pins_are_stronger_than_contact():
-    """A sheet held at its corners catches another one; the corners do not move."""
     points, velocity, _ = _two(2.0)
     corners = [[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.0, 0.3, 0.0], [0.3, 0.3, 0.0]]
     solver, state = scene(points, Contact(), [PinnedPoints(corners)], velocity=velocity)
@@ -201,7 +194,6 @@ def test_sheets_in_the_same_place_come_apart():
 
 
 def test_everything_in_contact_at_half_the_thickness():
-    """Every place of five sheets overlaps its neighbours: the pile opens in order, at bounded speeds."""
     solver, state = layers(5, 0.5 * THICKNESS, stiffness_damping=1e-3)
     later = march(solver, state, 0.1, frame=0.02)[-1]
     height = later.position[:, 2].reshape(5, -1)
@@ -211,7 +203,6 @@ def test_everything_in_contact_at_half_the_thickness():
 
 
 def test_a_thickness_above_the_spacing_is_kept():
-    """Three times the distance of the points: two sheets stop that far from each other, and leave themselves alone."""
     below, above = sheet(14, 14), sheet(8, 8, (0.053, 0.047, 0.2))
     points = MaterialPoints.join([below, above])
     velocity = torch.zeros_like(points.position)
@@ -231,8 +222,6 @@ def test_a_thickness_above_the_spacing_is_kept():
 
 @pytest.mark.parametrize("broken", ["normal", "radius", "both"])
 def test_patches_without_a_normal_or_a_size_end_finite(broken):
-    """A disc without a normal or a radius touches nothing, or by the normal of the other; nothing becomes NaN."""
-
     def change(surface):
         every = torch.arange(len(surface.place)) % 3 == 0
         facing = torch.where(every[:, None], 0.0, surface.normal) if broken != "radius" else surface.normal

@@ -38,7 +38,6 @@ def test_a_disc_counts_if_the_centre_of_the_other_is_above_it(arm, normal):
 
 
 def _collision(device, dtype=torch.float32):
-    """A small sheet that flies onto one that is held at two corners, beside a moving ball."""
     below, above = sheet(5, 5, dtype=dtype), sheet(3, 3, (0.023, 0.017, 0.1), dtype=dtype)
     points = MaterialPoints.join([below, above]).map(lambda t: t.to(device))
     velocity = torch.zeros_like(points.position)
@@ -99,7 +98,6 @@ def test_iterations_are_counted_where_there_are_obstacles(device, monkeypatch):
 
 
 def test_the_lists_are_those_of_a_tree(device):
-    """Sheets that lie across each other in many cells of the grid: both sides of all pairs, in a fixed order."""
     low = sheet(9, 9, dtype=torch.float32)
     points = MaterialPoints.join([low, sheet(9, 9, (0.0, 0.0, 0.4), dtype=torch.float32)]).map(lambda t: t.to(device))
     solver, state = scene(points, Contact(), transfer="kernels", gravity=ZERO)
@@ -160,7 +158,6 @@ def test_lists_that_do_not_fit_get_more_room(device, monkeypatch):
 
 
 def test_material_that_has_collapsed_is_refused(device, monkeypatch):
-    """More candidates than any buffer holds: a sentence, not wrong lists, and another rollout is possible."""
     monkeypatch.setattr(contact, "ROOM", 2)
     points, velocity, _ = _collision(device)
     solver, state = scene(points, Contact(), velocity=velocity, transfer="kernels")

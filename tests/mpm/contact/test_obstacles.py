@@ -1,5 +1,3 @@
-"""Obstacles against closed forms: sliding, resting, draping, pushing, and the momentum that they take."""
-
 import math
 
 import pytest
@@ -110,7 +108,6 @@ def _flying_ball(speed=1e4, turns=(), **settings):
 
 
 def test_a_ball_at_ten_kilometres_a_second_does_not_pass_a_sheet():
-    """The sheet flies before it; with the substep of the material, at rest, it was on the other side at once."""
     solver, still, state = _flying_ball()
     frame = 4e-5
     assert solver.substeps(still, frame) == 1  # no obstacle moves yet

@@ -24,7 +24,6 @@ LEFT, TOP = up_to(x=0.12), beyond(z=0.17)
 
 
 def on_each(*everywhere, cpu=()):
-    """Cases for ``kernel_device``; some of them run only on a CPU, where compiling is quick."""
     gpu = [pytest.param("cuda", case, marks=pytest.mark.gpu) for case in everywhere]
     return [pytest.param("cpu", case) for case in (*everywhere, *cpu)] + gpu
 
@@ -34,7 +33,6 @@ def noise(seed, *shape):
 
 
 def make_points(device, law=None, count=24, batch=(), **more):
-    """A body of two cells per side."""
     place = torch.rand(*batch, count, 3, generator=seeded(0))
     return make_body((0.06 + 0.18 * place).to(device), law, **more)
 
@@ -45,7 +43,6 @@ def make_body(position, law=None, youngs_modulus=1e4, **more):
 
 
 def set_going(solver, points, strain=0.2):
-    """Deformed and in motion."""
     shape = points.position.shape
     state = solver.init_state(points, noise(1, *shape).to(points.position))
     if solver.neighbours_fixed:
@@ -76,7 +73,6 @@ def make_solver(transfer, formulation="updated", **options):
 
 
 def run_both(points, run, formulation="updated", start=set_going, **options):
-    """The results of a function of solver and state with the torch substep and with the fused one."""
     found = []
     for transfer in ("torch", "kernels"):
         solver = make_solver(transfer, formulation, **options)
@@ -86,7 +82,6 @@ def run_both(points, run, formulation="updated", start=set_going, **options):
 
 
 def check_agreement(ends, tolerance=TOLERANCE, names=FIELDS):
-    """Both states are equal, and not the initial one."""
     pairs = list(zip(*(end if isinstance(end, list) else [end] for end in ends), strict=True))
     # a running total is as exact as its largest value so far, also where it comes back to nearly zero
     most = max(1e-9, *(float(peak(expected.work)) for expected, _ in pairs))

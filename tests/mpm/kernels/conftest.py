@@ -1,5 +1,3 @@
-"""One width of the kernels for all bodies."""
-
 import pytest
 
 from gaussian_swaying.mpm import total
@@ -7,5 +5,4 @@ from gaussian_swaying.mpm import total
 
 @pytest.fixture(autouse=True)
 def _one_width(monkeypatch):
-    """The number of lanes is a constant of the compiled kernel: the same for all bodies."""
     monkeypatch.setattr(total, "_lanes", lambda sizes: 4)

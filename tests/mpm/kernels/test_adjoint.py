@@ -31,12 +31,10 @@ def _random(seed, *shape):
 
 
 def _error(found, expected):
-    """Largest difference, relative to the largest value."""
     return float(peak(found.to(expected) - expected)) / max(float(peak(expected)), 1e-30)
 
 
 def _patches(count, dtype):
-    """Up to five patches for each point, of all directions, and none for every fourth."""
     point = torch.arange(5 * count) % count
     point = point[point % 4 > 0]
     normal = normalized(_random(3, len(point), 3))
@@ -69,7 +67,6 @@ def _gradients(
     attached=False,
     **settings,
 ):
-    """Gradients of a mixture of all fields at the end by every input, by name, and that mixture; it starts strained."""
     place = _place(batch)
     values = {
         "velocity": _random(1, *place.shape),
@@ -186,12 +183,10 @@ def test_gradients_of_a_rollout(name, kernel_device):
 
 
 def test_gradients_without_wind(kernel_device):
-    """No force at all: nothing is gathered but F."""
     _compare(kernel_device, ELASTIC["corotated"], wind=None, left_out=("volume",))
 
 
 def test_gradients_where_cells_are_cut(kernel_device, monkeypatch):
-    """Crowded cells are cut into pieces, whose sums are joined."""
     monkeypatch.setattr(total, "_lanes", lambda sizes: 2)
     _compare(kernel_device, ELASTIC["corotated"], steps=3)
 
@@ -200,13 +195,11 @@ def test_gradients_where_cells_are_cut(kernel_device, monkeypatch):
 
 
 def _refused(solver, state, forces=(), match=""):
-    """The kernels say why they do not compute a gradient."""
     with value_error(f"`transfer: kernels` has no gradients here, because .*{match}"):
         solver.rollout(state, DT, 1, list(forces))
 
 
 def _free(device, **settings):
-    """A solver of a sheet and its first state, whose nodal velocity requires a gradient."""
     place = _place().to(device, torch.float32)
     points = solid(place, 1e-4, 80.0)
     solver = MPMSolver(DX, transfer="kernels", **settings)
@@ -215,7 +208,6 @@ def _free(device, **settings):
 
 
 def test_kernels_refuse_what_they_do_not_cover(kernel_device):
-    """Nothing is silently left out of a gradient: with `transfer: auto` torch computes these."""
     solver, state = _free(kernel_device)
     count = state.position.shape[0]
     normal, area = torch.zeros(count, 3, device=kernel_device), torch.ones(count, device=kernel_device)

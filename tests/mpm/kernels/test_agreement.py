@@ -54,7 +54,6 @@ PATH = KeyedPath([DT, 30 * DT], [[0.0, 0.0, 0.0], [0.2, -0.1, 0.05]], [[0.0, 10.
 
 
 def sharper(pin, share):
-    """A pin that holds only nodes that are mostly its own."""
     return changed(pin, pinned_share=share)
 
 
@@ -174,7 +173,6 @@ def _named(scenes, device, **more):
 
 
 def _groups(points, count, aero):
-    """Up to a dozen patches for each point, none for some."""
     normal = normalized(noise(6, count, 3))
     area = 0.01 * torch.rand(count, generator=seeded(6))
     which = torch.randint(0, points.count - 3, (count,), generator=seeded(7))
@@ -182,7 +180,6 @@ def _groups(points, count, aero):
 
 
 def _settled(solver, points):
-    """After a substep, for F of a sheet and of a rigid part is not that of any nodes."""
     return solver.rollout(set_going(solver, points), DT, 1)
 
 
@@ -192,10 +189,6 @@ def _settled(solver, points):
     indirect=["kernel_device"],
 )
 def test_kernels_do_what_torch_does(kernel_device, scene):
-    """The second rollout has a longer list of patches, and scatters what the return map gave.
-
-    On a CPU in double precision but for numbers like friction: both compute the same formulas.
-    """
     formulation, names, boundaries, aero, more = scene
     more = dict(more)
     groups, batch, count = more.pop("groups", False), more.pop("batch", ()), more.pop("count", 24)
@@ -258,8 +251,6 @@ def test_an_obstacle_of_a_user_runs_in_torch(kernel_device):
 
 @in_both
 def test_crushed_and_inverted_particles(kernel_device, formulation):
-    """If the nearest rotation is not unique, as for a reflected ball, there is nothing to compare."""
-
     def start(solver, points):
         if solver.neighbours_fixed:
             state = set_going(solver, points, strain=0.9)
@@ -279,7 +270,6 @@ def test_crushed_and_inverted_particles(kernel_device, formulation):
 
 @in_both
 def test_wind_along_the_normal(kernel_device, formulation):
-    """Nothing of it is tangential."""
     points = make_points(kernel_device)
     up = torch.tensor([0.0, 0.0, 1.0], device=kernel_device).expand(*points.position.shape)
     wind = WindField([0.0, 0.0, -50.0]).to(kernel_device)
@@ -293,8 +283,6 @@ def test_wind_along_the_normal(kernel_device, formulation):
 
 
 def test_patches_without_flow_and_flat_ones(kernel_device):
-    """Air that moves with the patch, and a patch that is pressed to nothing."""
-
     def start(solver, points):
         state = set_going(solver, points)
         state.velocity[:4] = torch.tensor(WIND.flows[0].tolist(), device=kernel_device)
@@ -316,7 +304,6 @@ def test_patches_without_flow_and_flat_ones(kernel_device):
 )
 @pytest.mark.parametrize("programs", [1, 2048])
 def test_cells_of_any_size(kernel_device, case, programs, monkeypatch):
-    """Several chunks of lanes, pieces or warps for one cell; cells without a particle between others."""
     formulation, sizes = case
     if programs > 1 and (formulation == "updated" or lanes(kernel_device, 64) < 64):
         pytest.skip("only `total` cuts cells, and only on a GPU")
@@ -334,7 +321,6 @@ def test_cells_of_any_size(kernel_device, case, programs, monkeypatch):
 @pytest.mark.gpu
 @pytest.mark.parametrize("number", [32, 128])
 def test_every_number_of_lanes(number, monkeypatch):
-    """The others are used in other tests."""
     pytest.importorskip("triton")
     monkeypatch.setattr(total, "_lanes", lambda sizes: number)
     check_agreement(run_in_wind(make_points("cuda", count=300), "total"))
@@ -357,7 +343,6 @@ def test_particles_on_the_borders_of_cells(kernel_device, formulation):
 
 
 def test_what_leaves_the_grid_is_lost(kernel_device):
-    """It has no weight, does not affect the far side, and keeps its place; particles too near the edge are lost too."""
     points = make_points(kernel_device)
     outside = torch.tensor([[0.13, 0.14, 0.5], [0.5, 0.1, 0.1], [0.13, -0.4, 0.1], [0.15, 0.12, 0.349], [90.0, 0, 0]])
     count = len(outside)

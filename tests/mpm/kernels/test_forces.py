@@ -1,5 +1,3 @@
-"""Wind, custom forces and their device functions in the fused substep."""
-
 import pytest
 import torch
 from catalogue import ELASTIC, PLASTIC
@@ -31,7 +29,6 @@ from .bodies import (
 
 @in_both
 def test_the_cap_on_the_area_acts(kernel_device, formulation):
-    """It is also read again in each rollout: a recorded graph stores the address that it reads, not the value."""
     points = make_points(kernel_device)
     free, capped = make_load(points), make_load(points, max_area_ratio=0.5)
     solver = make_solver("kernels", formulation)
@@ -47,7 +44,6 @@ def test_the_cap_on_the_area_acts(kernel_device, formulation):
 
 @in_both
 def test_forces_and_drag_of_step(kernel_device, formulation):
-    """Drag without a force adds nothing to the work."""
     points = make_points(kernel_device)
     force = (0.3 * noise(8, *points.position.shape)).to(kernel_device)
     drag = (0.5 * noise(9, *points.mass.shape).abs()).to(kernel_device)
@@ -147,7 +143,6 @@ def test_forces_in_torch_among_the_kernels(kernel_device, formulation, case, mon
 @pytest.mark.parametrize("kernel_device", ["cpu"], indirect=True)
 @in_both
 def test_a_force_that_cannot_be_recorded_is_asked_by_the_host(kernel_device, formulation):
-    """The other forces then run in torch as well."""
     points = make_points(kernel_device, count=12)
 
     class Waiting(_Pull):
@@ -165,7 +160,6 @@ def test_a_force_that_cannot_be_recorded_is_asked_by_the_host(kernel_device, for
 
 @triton.jit
 def _toward(F, velocity, position, point, numbers, now, table, OPTIONS: tl.constexpr):
-    """Pulls along a vector by a share of each particle; has a resistance if compiled with it."""
     scale = point[0] * numbers[0] * F[0] * tl.load(table + 1)
     resistance = point[0] * 0
     if OPTIONS[0]:
@@ -211,7 +205,6 @@ class _Toward(Force):
 @pytest.mark.parametrize("resists", [False, True])
 @in_both
 def test_a_twin_from_outside(kernel_device, formulation, resists):
-    """Alone, with winds before and after it, and without it again."""
     points = make_points(kernel_device, count=12)
     own = _Toward(points, resists)
 
@@ -231,7 +224,6 @@ def test_a_twin_from_outside(kernel_device, formulation, resists):
 @pytest.mark.gpu
 @in_both
 def test_forces_in_torch_are_replayed_from_graphs(formulation):
-    """Python is not called after recording; changes in place take effect, and a changed number is recorded again."""
     pytest.importorskip("triton")
     points = make_points(torch.device("cuda"), count=60)
     pulls = [_Pull("cuda", 1.0) for _ in range(2)]

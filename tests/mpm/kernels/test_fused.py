@@ -1,5 +1,3 @@
-"""Buffers of the fused substep, what it refuses, where the kernels are used, what they measure, and boundaries."""
-
 import dataclasses
 import gc
 import math
@@ -39,7 +37,6 @@ from .test_agreement import BOUNDARIES
 
 @in_both
 def test_one_solver_within_inference_mode_and_without(kernel_device, formulation):
-    """With patches that change in place in between."""
     points = make_points(kernel_device, count=12)
     solvers = [make_solver(transfer, formulation) for transfer in ("torch", "kernels")]
     load = make_load(points)
@@ -118,7 +115,6 @@ class OwnLaw(FixedCorotated):
 
 @pytest.mark.parametrize("what", ["float64 on a GPU", "custom law"])
 def test_what_the_kernels_cannot_do(kernel_device, what):
-    """``auto`` uses torch, ``kernels`` raises an error with the reason."""
     points, reason = make_points(kernel_device), "the law OwnLaw has no device functions"
     if what == "custom law":
         points = dataclasses.replace(points, laws=(OwnLaw(),))
@@ -136,7 +132,6 @@ def test_what_the_kernels_cannot_do(kernel_device, what):
 
 
 def test_who_computes_a_substep(kernel_device):
-    """On a GPU sums of ``updated`` have no fixed order; on a CPU they always have one."""
     points, ordered = make_points(kernel_device), kernel_device.type == "cpu"
     for formulation, settings, has_kernels in (
         *((formulation, {}, True) for formulation in FORMULATIONS),
@@ -238,7 +233,6 @@ def test_courant_number_of_what_is_broken_is_not_finite(kernel_device, law):
     ("kernel_device", "name"), on_each("pin and plane", "walls and pins", cpu=["walls"]), indirect=["kernel_device"]
 )
 def test_boundaries_of_many_scenes(kernel_device, name):
-    """Each scene has its own reaction impulses; a program may have nodes of two."""
     points = make_points(kernel_device, count=12, batch=(3,))
 
     def start(solver, points):
@@ -277,7 +271,6 @@ def test_held_points_stay_where_they_are_and_give_the_same_bits():
 
 
 def test_nodes_held_in_a_batch_of_winds(kernel_device):
-    """The momentum that pins take is summed for each scene, and all scenes share their patches."""
     points = make_points(kernel_device, count=40, batch=(2,))
     winds = [WindField([0.0, -8.0, 0.0]), WindField([3.0, 9.0, 0.0])]
     listed = make_load(points, winds)

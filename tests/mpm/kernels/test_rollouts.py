@@ -1,5 +1,3 @@
-"""Rollouts of the fused substep: changing substeps, looks on the way, graphs and their memory."""
-
 import gc
 import math
 from functools import partial
@@ -67,7 +65,6 @@ def test_a_substep_that_changes(kernel_device, formulation):
 
 @in_both
 def test_rollouts_in_parts(kernel_device, formulation, monkeypatch):
-    """Longer than the schedule and the sorting of the particles; the wind and the work continue."""
     monkeypatch.setattr(run, "MAX_STEPS", 4)
     monkeypatch.setattr(updated, "sorted_for", lambda *known: 2)
     wind = WindField(schedule=[FlowKey(0.0, [0.0] * 3), FlowKey(5 * DT, [30.0, 0.0, 0.0])], interpolation="linear")
@@ -117,7 +114,6 @@ def test_looks_on_the_way(kernel_device, case, monkeypatch):
 @pytest.mark.gpu
 @pytest.mark.parametrize("wide", [False, True], ids=["of one number", "of four numbers"])
 def test_atomic_sums(wide, monkeypatch):
-    """An older GPU adds the numbers of a node one by one; more points share a cell than are summed up before."""
     if wide and torch.cuda.get_device_capability() < (9, 0):
         pytest.skip("this GPU has no such instruction")
     monkeypatch.setattr(updated, "wide", lambda device: wide)
@@ -142,7 +138,6 @@ def test_many_substeps(formulation):
 
 
 def _gusty():
-    """A wind that is another in every substep."""
     gusts = [SineSway(period=0.01), GaussianGust(1.0, interval=2 * DT)]
     return WindField(schedule=[FlowKey(0.0, [5.0, 0.0, 0.0]), FlowKey(0.004, [0.0, 5.0, 1.0])], modulations=gusts)
 
@@ -159,7 +154,6 @@ REPLAYED = {
 @pytest.mark.slow(gate=["cpu-a hinge", "cpu-no wind"])
 @pytest.mark.parametrize("case", REPLAYED)
 def test_replayed_rollouts_give_the_same_bits(kernel_device, case, monkeypatch):
-    """On a GPU nothing is recorded at first; results stay as they are when another rollout follows."""
     steps = 37 if kernel_device.type == "cuda" else 5
     monkeypatch.setattr(total, "_PROGRAMS", 1 if case == "nodes, crowded cells" else 2048)
     given = REPLAYED[case]
@@ -188,7 +182,6 @@ def test_replayed_rollouts_give_the_same_bits(kernel_device, case, monkeypatch):
 
 @in_both
 def test_a_replayed_rollout_follows_what_changes(kernel_device, formulation):
-    """Numbers of the wind and patches that change in place, a force that is another one, the substep, time and grid."""
     points = make_points(kernel_device, count=12)
     schedule = WindField(schedule=[FlowKey(0.005, [30.0, 0.0, 0.0])])
     load, other = make_load(points), make_load(points, schedule, seed=7, C_D=2.0)
@@ -224,7 +217,6 @@ def test_a_replayed_rollout_follows_what_changes(kernel_device, formulation):
 
 
 def test_a_grid_that_comes_back(kernel_device):
-    """A graph recorded for a grid finds its node positions again, even after another grid was used."""
     points = make_points(kernel_device)
     count = 4 if kernel_device.type == "cuda" else 1
     boundaries = [Wall(HalfSpace([0.0, 0.0, 0.13], [0.0, 0.0, 1.0]))]
@@ -278,7 +270,6 @@ def test_grids_that_grow_take_the_memory_of_the_largest():
 @pytest.mark.gpu
 @pytest.mark.parametrize("flight", ["drifts", "expands"])
 def test_a_cloud_that_flies_away_is_followed_in_bounded_memory(flight):
-    """Its grid moves or grows over a hundred frames, but much less often than once per frame."""
     pytest.importorskip("triton")
     points = _cloud(500)
     solver = MPMSolver(
@@ -311,7 +302,6 @@ BROKEN += [("velocity", -math.inf), ("velocity", 1e12), ("velocity", 1e30)]
 @pytest.mark.parametrize(("name", "value"), BROKEN)
 @pytest.mark.parametrize("transfer", ["torch", "kernels"])
 def test_a_broken_particle_is_reported_and_breaks_nothing_else(kernel_device, transfer, name, value):
-    """Also within recorded substeps, and the device stays usable."""
     points, steps = make_points(kernel_device), 9 if kernel_device.type == "cuda" else 2
     solver = make_solver(transfer, boundaries=[Wall(HalfSpace([0.0, 0.0, -0.1], [0.0, 0.0, 1.0]))])
     start = solver.fit_grid(set_going(solver, points, strain=0.02), 0.04)
@@ -362,7 +352,6 @@ CASES = {
 
 
 def _end(case, dtype):
-    """Of two rollouts, of which the second one is replayed, by a solver of its own."""
     generator = seeded(0)
     place = 0.1 + 0.9 * rand(3000, 3, generator=generator)
     place[:, 2] = 0.2 + 0.1 * place[:, 2]
@@ -382,7 +371,6 @@ def _end(case, dtype):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 @pytest.mark.parametrize("case", CASES)
 def test_threads_change_no_bit(case, dtype, use_threads):
-    """Nor does another run."""
     ends = []
     with torch.no_grad():
         for number in (1, 2, 4, 1):

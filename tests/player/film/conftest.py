@@ -1,5 +1,3 @@
-"""A small flag, recorded as a run."""
-
 import dataclasses
 
 import pytest
@@ -45,8 +43,6 @@ SETTINGS = {
 
 @pytest.fixture(scope="session")
 def make_flag(tmp_path_factory):
-    """The simulation of the flag, with some settings changed, from its file."""
-
     def make(**changes):
         path = tmp_path_factory.mktemp("flag") / "flag.yaml"
         path.write_text(yaml.safe_dump(merged(SETTINGS, changes)))
@@ -57,7 +53,6 @@ def make_flag(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def flags(tmp_path_factory):
-    """Settings of a scene of two flags, one less than a cell behind the other, which share no nodes."""
     flag = FlagScene(spacing=0.05).generate()
     path = tmp_path_factory.mktemp("flags") / "flags.ply"
     places = [flag.means + torch.tensor([0.0, y, 0.0]) for y in (-0.045, 0.04)]
@@ -67,7 +62,6 @@ def flags(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def run(make_flag, tmp_path_factory):
-    """The folder of a run of the flag."""
     folder = tmp_path_factory.mktemp("run") / "flag"
     make_flag().run(folder, FRAMES, progress=False)
     return folder

@@ -1,5 +1,3 @@
-"""A film in a real browser."""
-
 import base64
 import json
 import re
@@ -45,7 +43,6 @@ def film(run, tmp_path_factory):
 
 @pytest.fixture
 def show(browser):
-    """Opens a film in a window of a size."""
     opened = []
 
     def show(path, width=320, height=180, browser=browser):
@@ -81,7 +78,6 @@ def moved(make_flag, stretched):
 
 
 def test_the_film_is_the_run(show, film, run, moved):
-    """Centres from the GPU, pictures as those of the run, scrubbing, playing; nothing is asked of a network."""
     import imageio.v3 as iio
 
     page, pictures = show(film), {}
@@ -104,7 +100,6 @@ def test_the_film_is_the_run(show, film, run, moved):
 
 @pytest.fixture
 def served(browser, run, tmp_path):
-    """Opens a page beside a film and what ``--player`` wrote; programs of engines are at other addresses."""
     write_film(run, tmp_path / "flag.sway")
     assert main(["--player", str(tmp_path)]) == 0
     page = listened(browser.new_page(viewport={"width": 320, "height": 180}))
@@ -151,7 +146,6 @@ def three(request):
 
 @pytest.fixture
 def playcanvas(request, tmp_path):
-    """PlayCanvas from npm, in the version that the player is built with."""
     lock = json.loads((request.config.rootpath / "tools/player/package-lock.json").read_text(encoding="utf-8"))
     known = lock["packages"]["node_modules/playcanvas"]
     command = ["npm", "pack", "--json", f"playcanvas@{known['version']}"]
@@ -185,8 +179,6 @@ DRAWN = {
 
 @pytest.fixture
 def example(request, served):
-    """Opens an example with an engine of its own, once its film has come."""
-
     def example(name):
         text = (request.config.rootpath / f"examples/web/{name}.html").read_text(encoding="utf-8")
         page = served(text, **request.getfixturevalue(name))
@@ -284,7 +276,6 @@ def test_gaussians_are_sorted_from_far_to_near(show, film):
 
 @pytest.fixture(scope="module")
 def large(run, tmp_path_factory):
-    """The same film as if it had many Gaussians and frames: in parts, of which the first are small."""
     target = tmp_path_factory.mktemp("large") / "film.html"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(film_page, "FIRST", {"moving": 200, "still": 200})
@@ -295,7 +286,6 @@ def large(run, tmp_path_factory):
 
 
 def test_a_large_film_begins_with_some_of_its_gaussians_and_ends_as_the_same(show, film, large):
-    """It plays before all has come; afterwards the picture is that of the film in one part."""
     page = show(large)
     assert page.evaluate("film.head.parts.map(([kind]) => kind).join()") == (
         "moving,still,frames,moving,frames,moving,frames"
@@ -310,7 +300,6 @@ def test_a_large_film_begins_with_some_of_its_gaussians_and_ends_as_the_same(sho
 
 
 def test_a_film_that_is_cut_short_says_so(show, large, tmp_path):
-    """Within the parts that the first picture needs, and within the others, while what has come is shown."""
     sentence = "The file of this film is cut short: copy it again, or export it again."
     content = large.read_text()
     ends = {name: content.index(f'id="film-{name}"') for name in ("code", "part-1", "part-4", "part-6")}
@@ -329,7 +318,6 @@ def test_a_film_that_is_cut_short_says_so(show, large, tmp_path):
 
 @pytest.mark.slow
 def test_controls_at_the_size_of_a_phone(show, film):
-    """Slider, button and a drag; everything lies within the window."""
     page = show(film, 390, 844)
     page.locator("#play").click()
     page.evaluate("film.seek(0)")

@@ -55,7 +55,6 @@ def check(simulation, film, frame, state):
 
 @pytest.mark.parametrize("points", ["grid", "gaussian"])
 def test_centres_and_covariances_are_those_of_the_run(make_flag, run, tmp_path, points):
-    """Every Gaussian in several frames; also where they follow material points, which read the same nodes."""
     if points == "gaussian":
         run = tmp_path / "run"
         make_flag(scene={"points": "gaussian"}).run(run, FRAMES, progress=False)
@@ -69,7 +68,6 @@ def test_centres_and_covariances_are_those_of_the_run(make_flag, run, tmp_path, 
 
 @pytest.mark.parametrize("points", ["grid", "gaussian"])
 def test_parts_with_nodes_of_their_own(make_flag, flags, tmp_path, points):
-    """Two flags closer than a cell, in one cell each with a stencil of its own."""
     make = lambda: make_flag(scene=flags | {"points": points}, recorder={"renders": []})  # noqa: E731
     make().run(tmp_path / "run", 4, progress=False)
     simulation, film = make(), read_film(tmp_path / "run")
@@ -81,7 +79,6 @@ def test_parts_with_nodes_of_their_own(make_flag, flags, tmp_path, points):
 
 
 def test_carried_static_and_plated_gaussians(make_flag, tmp_path):
-    """Part of the flag is static, part is faint and follows, and the sheet has three layers."""
     region = {"class_path": "Box", "init_args": {"min": [None, None, 0.2], "max": [None, None, None]}}
     make = lambda: make_flag(scene={"region": region, "layers": 3, "up": [0.0, 0.6, 0.8], "longest_side": 0.5})  # noqa: E731
     make().run(tmp_path / "run", 4, progress=False)
@@ -113,7 +110,6 @@ def test_a_bundle_holds_the_run(make_flag, run, tmp_path):
 
 
 def test_another_program_reads_a_bundle(run, tmp_path, capsys, monkeypatch):
-    """By what its page says alone, in numpy; and the example of the page."""
     monkeypatch.chdir(tmp_path)
     write_film(run, tmp_path / "flag.sway")
     content, at, blocks = (tmp_path / "flag.sway").read_bytes(), 8, []
@@ -163,7 +159,6 @@ def test_a_bundle_that_cannot_be_read(run, tmp_path, harm, words):
 
 
 def test_nothing_is_lost_in_the_file(run, tmp_path, capsys):
-    """What stands in the page is what was put there; the page names nothing outside itself; its size is bounded."""
     assert main(["--web", str(run)]) == 0
     told = capsys.readouterr().out
     text = (run / "film.html").read_text()
@@ -214,7 +209,6 @@ def test_a_large_film_comes_in_parts(run, monkeypatch):
 
 
 def test_what_comes_first_is_spread_over_all():
-    """Of places along a line any first part leaves no gap longer than four times the mean; none is missing."""
     places = torch.rand(1000, 1, generator=seeded(0)).sort(0)[0] * torch.tensor([1.0, 0.0, 0.0])
     order = spread(places)
     assert sorted(order.tolist()) == list(range(1000))
@@ -226,7 +220,6 @@ def test_what_comes_first_is_spread_over_all():
 
 
 def test_gaussians_grow_less_where_many_lie_behind_each_other(make_flag):
-    """A hundred times as many behind each other need a tenth of the growth."""
     cloud = FlagScene(spacing=0.05).generate()
     camera = OrbitCamera(width=640, height=360, azimuth=-90.0, radius=1.0)
     found = []
@@ -241,7 +234,6 @@ def test_gaussians_grow_less_where_many_lie_behind_each_other(make_flag):
 
 
 def test_the_program_is_built_from_its_sources(request):
-    """The first line of the built program names the checksum of the sources, and the licences those of the packages."""
     player = request.config.rootpath / "tools/player"
     own = sorted(path.name for path in player.glob("*.js") if not path.name.startswith("sway"))
     shared = ["build.js", "bundle.js", "film.glsl.js"]

@@ -1,5 +1,3 @@
-"""Small simulations, and the solver of a browser in Node.js."""
-
 import json
 import subprocess
 
@@ -56,13 +54,11 @@ def maker(settings, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def make(tmp_path_factory):
-    """The simulation of a calm sheet, with some settings changed."""
     return maker(CALM, tmp_path_factory)
 
 
 @pytest.fixture(scope="session")
 def sway(tmp_path_factory):
-    """That of the starter of a shrub, which sways by modes in a wind with turbulence."""
     folder = tmp_path_factory.mktemp("shrub")
     previewed(block([0.5, 0.4, 1.0], GREEN), folder, hold="bottom", kind="shrub", look="gusts")
     return maker(yaml.safe_load((folder / "starter.yaml").read_text()), tmp_path_factory)
@@ -70,7 +66,6 @@ def sway(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def written(make, tmp_path_factory):
-    """The page of the calm sheet."""
     target = tmp_path_factory.mktemp("page") / "sheet.html"
     write_live_web(make(), "sheet", target)
     return target
@@ -103,7 +98,6 @@ def moved_means(simulation, state, moved):
 
 
 def apart(simulation, state, moved):
-    """The largest distance of a Gaussian from its place in a state over the largest motion of one, and that motion."""
     expected = simulation.scene.deformed(state).means
     motion = longest(expected - simulation.scene.rest().means)
     error = longest(moved_means(simulation, state, moved) - expected)
@@ -111,7 +105,6 @@ def apart(simulation, state, moved):
 
 
 def opened(context, path, settings):
-    """A page, which is loaded or says why not."""
     page = listened(context.new_page())
     page.goto(path.as_uri() + settings)
     until(lambda: page.evaluate(SHOWN))
@@ -119,7 +112,6 @@ def opened(context, path, settings):
 
 
 def drawn_apart(page, simulation):
-    """As :func:`apart`, of the Gaussians as a page draws them, read back from there; in sizes of the object."""
     values = page.evaluate("windPage.tunnel.positions().then((found) => Array.from(found))")
     found = double(values).reshape(-1, 3)
     state = simulation.start()

@@ -1,5 +1,3 @@
-"""The solver in a browser, in Node.js, against the package's own run."""
-
 import hashlib
 from dataclasses import replace
 
@@ -20,7 +18,6 @@ from .conftest import SIDE, apart, moved_means
 
 
 def run(simulation, frames):
-    """The state after some frames, and the substeps of all of them."""
     state, steps = simulation.start(), 0
     for _ in range(frames):
         steps += simulation.stepper.substeps(state)
@@ -130,7 +127,6 @@ OBSTACLES = {
 
 @pytest.mark.parametrize("name", OBSTACLES)
 def test_contact_with_obstacles(make, in_node, name):
-    """After two seconds, of whose motion the obstacles stop a part."""
     pins = {"class_path": "PinnedRegion", "init_args": {"region": SIDE}}
     simulation = make(solver={"boundaries": [pins, *OBSTACLES[name]]})
     state, steps = run(simulation, 50)
@@ -145,7 +141,6 @@ def test_contact_with_obstacles(make, in_node, name):
 
 
 def test_a_rider_on_the_ground(make, in_node, tmp_path):
-    """A box that nothing holds slides down a slope in the wind; after two seconds."""
     write_ply(tmp_path / "box.ply", block([0.4, 0.4, 0.3], GREEN))
     scene = {"generator": None, "ply": str(tmp_path / "box.ply"), "metres_per_unit": 1.0}
     ground = obstacle("HalfSpace", point=[0, 0, 0], normal=[0, 0, 1], friction=0.1)
@@ -163,7 +158,6 @@ def box(low, high):
 
 
 def test_a_ball_on_a_cloth(make, in_node, tmp_path):
-    """It sinks onto the cloth, and dents it; without contact it falls through."""
     made = DemoScene("ball_on_cloth", spacing=0.04, size=0.8).generate()
     means = made.means.clone()
     means[:, 2] -= torch.where(means[:, 2] > 0.6, 0.13, 0.0)  # as low as it may be without sharing nodes
@@ -204,7 +198,6 @@ def test_the_starter_of_a_plant_by_its_modes(sway, in_node):
 
 
 def test_parts_with_nodes_of_their_own(make, in_node, tmp_path):
-    """Two sheets, less than a cell apart."""
     sheet = FlagScene(spacing=0.05).generate()
     places = [sheet.means + torch.tensor([0.0, y, 0.0]) for y in (-0.045, 0.04)]
     write_ply(tmp_path / "two.ply", together(*(replace(sheet, means=place) for place in places)))
@@ -241,7 +234,6 @@ def test_what_the_visitor_does(make, in_node):
 
 
 def test_what_the_visitor_does_to_modes(sway, in_node):
-    """As above, of a shrub that weighs something."""
     simulation = sway(solver={"gravity": [0.0, 0.0, -9.8]})
     wind = {"kind": "wind", "flow": [0.0, -2.0, 0.0], "gusts": 0.0}
     frames, stiffer = {"kind": "frames", "count": 10}, {"kind": "stiffness", "factor": 2.0}
@@ -289,7 +281,6 @@ def test_what_a_browser_cannot_simulate_is_refused(make, name):
 
 
 def test_the_worker_is_built_from_its_sources(request):
-    """Its first line names their checksum; every source is part of the page or of the worker."""
     player = request.config.rootpath / "tools/player"
     own = [
         "block.js",

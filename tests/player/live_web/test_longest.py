@@ -1,5 +1,3 @@
-"""The longest substep of a page, against what grows."""
-
 import pytest
 import torch
 from shared import seeded
@@ -9,7 +7,6 @@ from gaussian_swaying.player.live_web.longest import MARGIN, fastest_vibration, 
 
 @pytest.mark.parametrize("law", ["FixedCorotated", "SpringNetwork"])
 def test_what_shakes_grows_only_beyond_the_largest_stable_step(make, law):
-    """Of random velocities without pins and damping."""
     solver = {"boundaries": [], "damping": 0.0, "gravity": [0.0, 0.0, 0.0]}
     simulation = make(solver=solver, material={"law": {"class_path": law}, "nu": 0.25})
     rest, bound = simulation.start(), simulation.solver.bound

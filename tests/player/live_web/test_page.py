@@ -54,7 +54,6 @@ def _grabbed(page):
 
 
 def _stops(page):
-    """Wait until the motion stands still, and return its time."""
     times = [page.evaluate("windPage.tunnel.playback.newest ?? 0")]
 
     def stands_still():
@@ -67,7 +66,6 @@ def _stops(page):
 
 
 def test_what_the_visitor_does(show, written):
-    """The clock, pause, wind, link, a pull and a turn of the view."""
     page = show(written, "#wind=0,0,0&gusts=0&stiffness=2&speed=0.25")
     until(lambda: page.evaluate("windPage.value('stiffness')") == 2)
     assert page.evaluate("['wind', 'gusts'].map(windPage.value)") == [[0, 0, 0], 0]
@@ -152,7 +150,6 @@ def test_a_browser_without_vectors_in_webassembly_says_so(show, written):
 
 
 def test_a_page_within_another_page(browser, written):
-    """``<gaussian-swaying>`` passes its attributes on, also when they change."""
     write_player(written.parent)
     outer = written.parent / "outer.html"
     element = f'<gaussian-swaying src="{written.name}" wind="1,2,0" view="0,-3,0,0,0,0"></gaussian-swaying>'

@@ -1,5 +1,3 @@
-"""The solver in compute shaders, on an adapter in software, against the package's own run."""
-
 import base64
 
 import pytest
@@ -82,7 +80,6 @@ def show(context):
 
 
 def both(one, other, part=None):
-    """Two cases in one, of the second only a part."""
     return merged(CASES[one], {part: CASES[other][part]} if part else CASES[other])
 
 
@@ -131,7 +128,6 @@ def test_a_page_after_two_seconds_and_after_its_device_is_lost(show, written, ma
 
 
 def test_chosen_by_hand(show, written):
-    """By itself a page takes no adapter in software, and says nothing; another solver goes on with the motion."""
     page = show(written, "")
     until(lambda: page.evaluate("windPage.state.why") == "it would run on the processor")
     assert page.evaluate("windPage.state.solver") == "webassembly"
@@ -168,7 +164,6 @@ def test_where_there_is_no_webgpu_the_processor_computes(make, on_gpu, why):
 
 
 def test_where_webgpu_is_slower_the_processor_computes(make, on_gpu):
-    """A page that is late with both takes the faster one."""
     told, _ = on_gpu(
         make(), {"kind": "run", "on": True, "speed": 1e3}, before=OTHER, solver="auto", last="it is too slow here"
     )

@@ -18,7 +18,6 @@ from gaussian_swaying.training.data.datamodule import CaptureDataModule  # noqa:
 
 @pytest.fixture
 def folder(tmp_path):
-    """Nine images with alpha, of which two are for testing."""
     names = [f"images/{index:03d}.png" for index in range(9)]
     return write_transforms(tmp_path / "capture", arc(9), names, channels=4)
 

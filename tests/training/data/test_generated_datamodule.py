@@ -1,5 +1,3 @@
-"""A generated capture as training data: drawn once, never over something else."""
-
 import json
 import shutil
 
@@ -45,7 +43,6 @@ def test_other_things_are_left_alone(tmp_path):
 
 
 def test_of_two_runs_at_once_the_faster_one_draws(tmp_path, monkeypatch):
-    """The folder appears while the images are drawn: with the same settings it is taken, with others refused."""
     flag = GeneratedCapture(views=9, size=16)
     data = GeneratedDataModule(tmp_path / "flag", flag, workers=1)
     draw = GeneratedCapture.write

@@ -137,7 +137,6 @@ def _middle(state: MPMState) -> torch.Tensor:
 
 
 def _timed(solver: MPMSolver, state: MPMState, steps: int = 50) -> float:
-    """Seconds that some substeps take."""
     dt = 0.5 * solver.stable_substep(state)
     begin = time.perf_counter()
     with torch.inference_mode():

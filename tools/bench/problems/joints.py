@@ -35,7 +35,6 @@ def _body(place: Tensor, attached: Tensor | None, settings: Settings) -> Materia
 def _ratio(
     settings: Settings, points: MaterialPoints, joint: PointJoint, shape: Tensor, omega: float, gravity: float = 0.0
 ) -> Result:
-    """A quarter of a period, over the time in which a velocity of some shape ends; with gravity, stretched by it."""
     joints = Joints(points, [joint], float(stable_limit(points, 1.0).amin()))
     solver = settings.solver(1.0, gravity=(gravity, 0.0, 0.0))
     weight = points.mass.double().cpu()[:, None] * shape

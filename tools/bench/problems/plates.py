@@ -48,7 +48,6 @@ class Hinge(Boundary):
 
 
 def _bspline(distance: Tensor) -> Tensor:
-    """Quadratic B-spline of a distance in cells (...)."""
     outer = 0.5 * (1.5 - distance).clamp(min=0).square()
     return torch.where(distance < 0.5, 0.75 - distance.square(), outer)
 

@@ -30,7 +30,6 @@ def turning(time: Tensor, amplitude: float) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _profile(radius: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The function h of the radius, with its first two derivatives."""
     s = radius - 1
     return 1 - 32 * s**2 + 256 * s**4, -64 * s + 1024 * s**3, -64 + 3072 * s**2
 

@@ -44,7 +44,6 @@ class _Invariant(Boundary):
         self.dx = dx
 
     def forward(self, velocity: Tensor, nodes: Nodes) -> Tensor:
-        """Copy the velocity along the layer."""
         assert nodes.position is not None
         place = nodes.position.reshape(-1, *nodes.position.shape[-2:])[0]
         column = velocity[..., (place[:, :2].abs() < 0.5 * self.dx).all(-1), :]
@@ -174,7 +173,6 @@ def _layer(
     volume_correction: bool,
     **more: Any,
 ) -> tuple[MPMSolver, MaterialPoints, MPMState]:
-    """Scenes with one column of a layer on a rough floor, consolidated under its weight."""
     dx = LENGTH / cells
     points = MaterialPoints.create(
         lattice(dx, (0, 0, 0), (0, 0, cells), settings).expand(scenes, -1, -1),
