@@ -8,7 +8,7 @@ import json
 import os
 import struct
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._inputs import LARGEST_HEAD, check_regular, parse_json, read_json
+from gaussian_swaying.gaussians.bones import Bones
 from gaussian_swaying.gaussians.cloud import GaussianCloud, joined
 from gaussian_swaying.gaussians.harmonics import SH_DC, rotate_sh
 from gaussian_swaying.gaussians.packed import check_count, logits, size_logarithms, usable
@@ -81,54 +82,152 @@ def encode_gltf(cloud: GaussianCloud, rotation: Tensor | None = None, metres_per
     """
     turn = _UPRIGHT if rotation is None else _UPRIGHT @ rotation.to("cpu", torch.float64)
     cloud = _moved(cloud.to("cpu", torch.float32), turn * metres_per_unit, torch.zeros(3, dtype=torch.float64))
-    opacity = cloud.opacities.sigmoid()
+    file = _Glb()
+    columns = {
+        "POSITION": file.add(cloud.means, bounds=True),
+        "COLOR_0": file.add(_shown_color(cloud), normalized=True),
+        f"{_EXTENSION}:ROTATION": file.add(torch.nn.functional.normalize(cloud.quats, dim=-1)[:, [1, 2, 3, 0]]),
+        f"{_EXTENSION}:SCALE": file.add(cloud.scales.exp()),
+        f"{_EXTENSION}:OPACITY": file.add(cloud.opacities.sigmoid()),
+    } | {name: file.add(cloud.sh[:, index]) for index, name in enumerate(_harmonics(cloud.sh_degree))}
+    node: dict[str, Any] = {"mesh": 0, "translation": cloud.origin} if any(cloud.origin) else {"mesh": 0}
+    return file.encode(columns, nodes=[node], scenes=[{"nodes": [0]}])
+
+
+def encode_skinned_gltf(
+    cloud: GaussianCloud, bones: Bones, fps: float, rotation: Tensor | None = None, metres_per_unit: float = 1.0
+) -> bytes:
+    """A .glb file whose Gaussians move with the joints of a skin, in the animation ``wind``; without harmonics above 0.
+
+    Positions and sizes have 16 bits, rotations 8. Programs that do not know skins show the Gaussians at rest.
+
+    Args:
+        cloud: The Gaussians at rest.
+        bones: What moves them, in the units and axes of the scene.
+        fps: Frames per second.
+        rotation: As for :func:`encode_gltf`.
+        metres_per_unit: As for :func:`encode_gltf`.
+
+    Returns:
+        The content of the file.
+    """
+    turn = _UPRIGHT if rotation is None else _UPRIGHT @ rotation.to("cpu", torch.float64)
+    matrix, origin = turn * metres_per_unit, torch.tensor(cloud.origin, dtype=torch.float64)
+    cloud = _moved(cloud.to("cpu", torch.float32), matrix, torch.zeros(3, dtype=torch.float64))
+    low, high = cloud.means.double().aminmax(dim=0)
+    half = max(0.5 * float((high - low).max()), float(cloud.scales.max().exp()))
+    middle = 0.5 * (low + high)
+    centres = (bones.centres + origin) @ matrix.T - torch.tensor(cloud.origin, dtype=torch.float64)
+    places = centres + bones.shifts @ matrix.T
+    turns = rotation_to_quat(turn @ quat_to_rotation(bones.quats) @ turn.T)[..., [1, 2, 3, 0]]
+    bind = torch.eye(4, dtype=torch.float64).repeat(len(centres), 1, 1)
+    bind[:, :3, :3] *= half
+    bind[:, :3, 3] = middle - centres
+    file = _Glb()
+    weight = (bones.weight * 255).round()
+    weight[torch.arange(len(weight)), weight.argmax(1)] += 255 - weight.sum(1)  # of sum one
+    columns = {
+        "POSITION": file.add(_steps((cloud.means.double() - middle) / half, 32767), normalized=True, bounds=True),
+        "COLOR_0": file.add(_shown_color(cloud), normalized=True),
+        f"{_EXTENSION}:ROTATION": file.add(
+            _steps(torch.nn.functional.normalize(cloud.quats, dim=-1)[:, [1, 2, 3, 0]], 127), normalized=True
+        ),
+        f"{_EXTENSION}:SCALE": file.add(_steps(cloud.scales.double().exp() / half, 32767), normalized=True),
+        f"{_EXTENSION}:OPACITY": file.add((cloud.opacities.sigmoid() * 255).round().to(torch.uint8), normalized=True),
+        _harmonics(0)[0]: file.add(cloud.sh[:, 0]),
+        "JOINTS_0": file.add(bones.index.to(torch.uint8)),
+        "WEIGHTS_0": file.add(weight.to(torch.uint8), normalized=True),
+    }
+    count, frames = len(centres), len(bones.quats)
+    inverse = file.add(bind.mT.reshape(count, 16).float(), vertex=False)
+    times = file.add(torch.arange(frames) / fps, vertex=False, bounds=True)
+    samplers, channels = list[dict[str, Any]](), list[dict[str, Any]]()
+    for joint in range(count):
+        for path, values in (("translation", places[:, joint].float()), ("rotation", turns[:, joint].float())):
+            samplers.append({"input": times, "output": file.add(values, vertex=False)})
+            channels.append({"sampler": len(samplers) - 1, "target": {"node": joint + 2, "path": path}})
+    joints = [{"translation": place} for place in places[0].tolist()]
+    root = {"children": [*range(2, count + 2)], **({"translation": cloud.origin} if any(cloud.origin) else {})}
+    at_rest = (middle + torch.tensor(cloud.origin, dtype=torch.float64)).tolist()
+    return file.encode(
+        columns,
+        used=["KHR_mesh_quantization"],
+        nodes=[{"mesh": 0, "skin": 0, "scale": [half] * 3, "translation": at_rest}, root, *joints],
+        scenes=[{"nodes": [0, 1]}],
+        skins=[{"joints": [*range(2, count + 2)], "skeleton": 1, "inverseBindMatrices": inverse}],
+        animations=[{"name": "wind", "samplers": samplers, "channels": channels}],
+    )
+
+
+def _steps(values: Tensor, top: int) -> Tensor:
+    """Numbers from -1 to 1 in whole steps."""
+    return (values * top).round().clamp(-top, top).to(torch.int16 if top > 127 else torch.int8)
+
+
+def _shown_color(cloud: GaussianCloud) -> Tensor:
+    """The colours of degree 0 in linear light, and opacities, for programs that show points."""
     shown = (cloud.sh[:, 0] * SH_DC + 0.5).clamp(0, 1)
     linear = torch.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
-    color = torch.cat([linear, opacity[:, None]], dim=1)
-    columns = {
-        "POSITION": cloud.means,
-        "COLOR_0": (color * 255).round().to(torch.uint8),
-        f"{_EXTENSION}:ROTATION": torch.nn.functional.normalize(cloud.quats, dim=-1)[:, [1, 2, 3, 0]],
-        f"{_EXTENSION}:SCALE": cloud.scales.exp(),
-        f"{_EXTENSION}:OPACITY": opacity,
-    } | {name: cloud.sh[:, index] for index, name in enumerate(_harmonics(cloud.sh_degree))}
-    accessors: list[dict[str, Any]] = []
-    views: list[dict[str, Any]] = []
-    data, start = list[bytes](), 0
-    for column in columns.values():
-        array = column.contiguous().detach().numpy()
-        whole = array.dtype == np.uint8
-        kind = "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}"
-        accessors.append({"bufferView": len(views), "count": len(cloud), "type": kind})
-        accessors[-1] |= {"componentType": 5121, "normalized": True} if whole else {"componentType": 5126}
-        views.append({"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": 34962})
-        data.append(array.tobytes())
-        start += array.nbytes
-    accessors[0] |= {"min": cloud.means.amin(0).tolist(), "max": cloud.means.amax(0).tolist()}
-    extension = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-    extension |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
-    primitive: dict[str, Any] = {"attributes": {name: index for index, name in enumerate(columns)}, "mode": 0}
-    primitive["extensions"] = {_EXTENSION: extension}
-    document = {
-        "asset": {"version": "2.0", "generator": "gaussian_swaying"},
-        "extensionsUsed": [_EXTENSION],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "translation": cloud.origin} if any(cloud.origin) else {"mesh": 0}],
-        "meshes": [{"primitives": [primitive]}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": start}],
-    }
-    text = json.dumps(document, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    size = _GLB.size + 2 * _CHUNK.size + len(text) + start
-    if size >= LARGEST:
-        raise ValueError(
-            f"A .glb file holds less than 4 GB, but this one would take {size:,} bytes: choose spz or sog."
+    return (torch.cat([linear, cloud.opacities.sigmoid()[:, None]], dim=1) * 255).round().to(torch.uint8)
+
+
+class _Glb:
+    """A .glb file that is being made."""
+
+    def __init__(self) -> None:
+        self.accessors, self.views, self.data, self.size = (
+            list[dict[str, Any]](),
+            list[dict[str, Any]](),
+            list[bytes](),
+            0,
         )
-    head = _GLB.pack(b"glTF", 2, size) + _CHUNK.pack(len(text), b"JSON") + text + _CHUNK.pack(start, b"BIN\0")
-    return head + b"".join(data)
+
+    def add(self, column: Tensor, *, normalized: bool = False, bounds: bool = False, vertex: bool = True) -> int:
+        """Add the numbers of an accessor (N,) or (N, K), in rows of whole four bytes, and return its place."""
+        array = column.contiguous().detach().numpy()
+        rows = array.reshape(len(array), -1)
+        stride = -(-rows.shape[1] * rows.itemsize // 4) * 4
+        kind = {1: "SCALAR", 16: "MAT4"}.get(rows.shape[1], f"VEC{rows.shape[1]}")
+        code = next(code for code, name in _TYPES.items() if np.dtype(name) == rows.dtype)
+        accessor = {"bufferView": len(self.views), "count": len(rows), "type": kind, "componentType": code}
+        accessor |= {"normalized": True} if normalized else {}
+        accessor |= {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()} if bounds else {}
+        padded = np.zeros((len(rows), stride), np.uint8)
+        padded[:, : rows.shape[1] * rows.itemsize] = rows.view(np.uint8)
+        view: dict[str, Any] = {"buffer": 0, "byteOffset": self.size, "byteLength": padded.nbytes}
+        view |= {"target": 34962} if vertex else {}
+        view |= {"byteStride": stride} if vertex and stride != rows.shape[1] * rows.itemsize else {}
+        self.accessors.append(accessor)
+        self.views.append(view)
+        self.data.append(padded.tobytes())
+        self.size += padded.nbytes
+        return len(self.accessors) - 1
+
+    def encode(self, columns: dict[str, int], used: Sequence[str] = (), **parts: Any) -> bytes:
+        """The file of one primitive with these accessors, and further parts of the document."""
+        extension = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+        extension |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
+        primitive = {"attributes": columns, "mode": 0, "extensions": {_EXTENSION: extension}}
+        document = {
+            "asset": {"version": "2.0", "generator": "gaussian_swaying"},
+            "extensionsUsed": [_EXTENSION, *used],
+            **({"extensionsRequired": [*used]} if used else {}),
+            "scene": 0,
+            **parts,
+            "meshes": [{"primitives": [primitive]}],
+            "accessors": self.accessors,
+            "bufferViews": self.views,
+            "buffers": [{"byteLength": self.size}],
+        }
+        text = json.dumps(document, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        size = _GLB.size + 2 * _CHUNK.size + len(text) + self.size
+        if size >= LARGEST:
+            raise ValueError(
+                f"A .glb file holds less than 4 GB, but this one would take {size:,} bytes: choose spz or sog."
+            )
+        head = _GLB.pack(b"glTF", 2, size) + _CHUNK.pack(len(text), b"JSON") + text
+        return head + _CHUNK.pack(self.size, b"BIN\0") + b"".join(self.data)
 
 
 def _opened(path: Path) -> tuple[dict[str, Any], np.ndarray]:

@@ -3,6 +3,7 @@ import torch
 from shared import refused
 
 from gaussian_swaying.cli.export import main
+from gaussian_swaying.cli.simulate import main as simulate
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.ply import read_ply, write_ply
 from gaussian_swaying.scenes.procedural import FlagScene
@@ -66,3 +67,44 @@ def test_gltf_as_given(flag, tmp_path):
     torch.testing.assert_close(found.means[:, 1], -0.5 * means[:, 1])
     assert main([str(tmp_path / "one.glb"), str(tmp_path / "two.glb"), "--up", "0", "1", "0"]) == 0
     torch.testing.assert_close(read_gaussians(tmp_path / "two.glb").means[:, 1], found.means[:, 1])
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run of 6 frames at 25 a second."""
+    folder = tmp_path_factory.mktemp("run")
+    config = folder / "flag.yaml"
+    config.write_text(
+        "scene:\n  generator: {class_path: FlagScene, init_args: {spacing: 0.1}}\nframes: 6\ndevice: cpu\n"
+        "solver: {dx: 0.2, boundaries: [{class_path: PinnedRegion, init_args: {region: {class_path: Box, "
+        "init_args: {min: [null, null, null], max: [0.1, null, null]}}}}]}\nwind: {flow: [4, 2, 0]}\n"
+        "recorder: {renders: []}\n"
+    )
+    assert simulate(["--config", str(config), "--output", str(folder / "run")]) == 0
+    return str(folder / "run")
+
+
+def test_a_part_of_a_run_at_another_rate_and_as_a_skin(run, tmp_path, capsys):
+    assert main([run, str(tmp_path / "f_#.ply"), "--fps", "12.5", "--box", "0", "-1", "0", "0.5", "1", "1"]) == 0
+    part, whole = read_ply(tmp_path / "f_0.ply"), len(FlagScene(spacing=0.1).generate().means)
+    assert len(list(tmp_path.glob("f_*.ply"))) == 3
+    assert part.means[:, 0].max() <= 0.5
+    assert len(part.means) < whole
+    assert len(read_ply(tmp_path / "f_2.ply").means) == len(part.means)  # those that were there at rest
+    assert main([run, str(tmp_path / "flag.glb"), "--bones", "6"]) == 0
+    assert "6 bones, " in capsys.readouterr().out
+    assert len(read_gaussians(tmp_path / "flag.glb").means) == whole
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["f_#.ply", "--fps", "10"], "--fps 12.5 is the nearest"),
+        (["f_#.ply", "--fps", "0"], "25 frames a second"),
+        (["f_#.ply", "--box", "5", "5", "5", "6", "6", "6"], "holds no Gaussian"),
+        (["f_#.ply", "--bones", "6"], "--bones is not for the frames of a run as .ply"),
+        (["f.glb", "--bones", "1"], "from 2 to 256"),
+    ],
+)
+def test_what_of_a_run_cannot_be_written(run, options, message, tmp_path, capsys):
+    refused(main, [run, str(tmp_path / options[0]), *options[1:]], capsys, message, folder=tmp_path)
