@@ -69,7 +69,7 @@ def logits(opacities: np.ndarray, steps: int) -> np.ndarray:
 
 
 def check_count(path: Path, count: int, harmonics: int, size: int | None = None) -> None:
-    """Raise ValueError if a file announces more Gaussians than it can hold, by the memory that reading them takes.
+    """Raise ValueError if reading as many Gaussians as a file announces would take more memory than its size allows.
 
     Args:
         size: Size of all files that hold them [bytes]; that of the file if None.

@@ -166,7 +166,7 @@ def _once(functions: Any) -> tuple[Any, ...]:
 def in_common(laws: Sequence[ConstitutiveLaw], name: str) -> Any:
     """The ``wave`` or ``energy`` density ``(F, mu, lam)`` shared by all laws.
 
-    None if they do not, or if it needs numbers of a law or an internal variable.
+    None if laws differ in it, or if it needs numbers of a law or an internal variable.
     """
     found = {law.device and (law.device.bounds if name == "wave" else law.device.density) for law in laws}
     free = all(law.device is not None and law.device.free for law in laws)

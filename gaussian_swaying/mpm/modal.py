@@ -425,7 +425,7 @@ def _power_of_two(value: float) -> float:
 
 
 def rayleigh(K: Any, M: Any, shapes: np.ndarray) -> float:
-    """The smaller Rayleigh quotient of leans along x and y, (n, 2)."""
+    """The smaller Rayleigh quotient of two shapes (n, 2), which lean along x and along y."""
     return float(((shapes * (K @ shapes)).sum(0) / (shapes * (M @ shapes)).sum(0)).min())
 
 

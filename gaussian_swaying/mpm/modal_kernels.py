@@ -64,7 +64,7 @@ def modal_factors(square, ratio, numbers, out, count, BLOCK: tl.constexpr):
 
 @triton.jit(do_not_specialize=("count",))
 def modal_moved(shapes, q, p, ahead, out, count, BLOCK: tl.constexpr):
-    """Products of the rows of shapes with amplitudes, ``ahead`` of now, and with their rates: two numbers a row."""
+    """For each row of ``shapes``, the displacement at ``ahead`` seconds from now, and the velocity."""
     row = tl.program_id(0)
     time = tl.load(ahead)
     at = tl.zeros([BLOCK], tl.float32)

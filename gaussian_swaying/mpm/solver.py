@@ -158,7 +158,7 @@ class MPMSolver(Fixed, Solver):
 
     @property
     def may_choose(self) -> bool:
-        """True if ``auto`` chooses a formulation with the next material."""
+        """True if the formulation is ``auto`` and not chosen yet; the next material decides."""
         return self.automatic and not self._decided
 
     @property

@@ -199,7 +199,7 @@ class Measurement:
         return self._wait()["more"]
 
     def read(self, check: bool = False) -> FrameDiagnostics:
-        """Wait for the measurements (one GPU synchronisation), of a batch as one.
+        """Wait for the measurements (one GPU synchronisation); the scenes of a batch are read as one scene.
 
         Args:
             check: Raise SimulationDiverged if a particle is NaN, infinite, outside the grid or extremely far away.

@@ -86,7 +86,11 @@ def find(name: str) -> Live | None:
 
 
 def number(name: str) -> Live:
-    """As :func:`find`."""
+    """The number with a name.
+
+    Raises:
+        ValueError: If there is none; the message lists the names.
+    """
     found = find(name)
     if found is None:
         raise ValueError(f"`{name}` is no number that may change: use one of {', '.join(names())}.")

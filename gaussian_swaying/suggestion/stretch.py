@@ -75,12 +75,12 @@ def typical_start(motion: Motion, frequency: float, tonal: bool = True) -> float
 
 
 def linear_motion(bound: Modes, force: WindForce, wind: WindField, top: torch.Tensor, rate: float) -> Motion:
-    """Mean displacement of some sites in a long record of a wind, without turns [m].
+    """Mean displacement [m] of the top of a body in a long record of a wind, without rotation.
 
     The air's damping is that in the mean wind, twice as strong along it as across.
 
     Args:
-        top: Share of each site in the top, shape (S,).
+        top: Weight of each site in the mean, shape (S,).
     """
     from scipy.cluster.vq import kmeans2
 

@@ -197,7 +197,7 @@ def film_of(simulation: Simulation, grid: GridSpec, nodes: Tensor, displacement:
 
 
 def order_of(scene: SimulatedScene) -> tuple[Tensor, Tensor]:
-    """The order of the Gaussians in a film: those that move come first, and any first part of either is spread.
+    """The order of the Gaussians in a film: those that move come first. The first of either are spread over all of it.
 
     Returns:
         The order of ``scene.moving``, as indices in it, shape (L,), and of all, as indices in the splat, shape (N,).
@@ -251,8 +251,8 @@ def spread(position: Tensor, first: int = 1) -> Tensor:
     """An order (N,) of places (N, 3) whose first ones are spread over all of them.
 
     Places are sorted along a Z-order curve and taken in the order of van der Corput's sequence: the second lies in the
-    middle, the third in the middle of the first half, and so on. Those of a part, of which the first one has a length,
-    are in the order of the curve, as neighbours that are alike compress to less.
+    middle, the third in the middle of the first half, and so on. Within the part of the ``first``,
+    and each of ``PART`` after it, they return to the order of the curve, as neighbours that are alike compress to less.
     """
     count = len(position)
     if count < 2:

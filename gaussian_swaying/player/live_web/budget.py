@@ -23,7 +23,7 @@ TOUCHING = 2.0
 
 
 def load_of(simulation: Simulation) -> float:
-    """Cost of a simulation at rest: points times substeps per second [1/s], in those of WebAssembly."""
+    """Cost of a simulation at rest, as points times substeps that WebAssembly would do each second [1/s]."""
     surface = simulation.scene.surface_places
     slower = SWAYING if simulation.solver.formulation == "modes" else 1.0
     slower *= TOUCHING if surface is not None and surface.contact is not None else 1.0
