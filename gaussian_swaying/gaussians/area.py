@@ -9,6 +9,7 @@ from torch import Tensor
 
 from gaussian_swaying.geometry.groups import equal_rows
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
+from gaussian_swaying.kernels.launch import replaces
 
 _RAYS = 32  # number of directions in which the cell of a patch is measured
 _SLAB = 0.75  # half thickness of one sheet, in neighbour spacings
@@ -93,7 +94,7 @@ def coverage_area(
             rows = slice(start, start + _CHUNK)
             offset = site[index[rows]] - site[rows, None]
             parts = offset, distance[rows], normal[rows], disc[rows], disc[index[rows]]
-            cell[rows], same[rows] = _cell_area(*parts, start)
+            cell[rows], same[rows] = _cells(*parts, start)
         for start in range(0, len(site), 8192):
             rows = slice(start, start + 8192)
             # g of every candidate at this site, the site's own Gaussians first
@@ -126,6 +127,19 @@ def _open_cosine(neighbours: Tensor) -> Tensor:
     """
     half_angle = math.pi * (1 - _FALSE_EDGE ** (1 / neighbours.clamp_min(1)))
     return half_angle.clamp(math.radians(50), math.radians(85)).cos()
+
+
+def _cells(
+    offset: Tensor, distance: Tensor, normal: Tensor, disc: Tensor, discs: Tensor, phase: int
+) -> tuple[Tensor, Tensor]:
+    if not replaces((offset,), torch.float64):
+        return _cell_area(offset, distance, normal, disc, discs, phase)
+    from gaussian_swaying.gaussians.area_triton import cells
+
+    neighbours = offset.shape[1]
+    cluster = _CLUSTER * math.sqrt(math.pi / neighbours)
+    ray, open_cosine = _rays(phase, len(offset)), _open_cosine(torch.arange(neighbours + 1, dtype=torch.float64))
+    return cells(offset, distance, normal, disc, discs, ray, open_cosine, cluster, _SLAB, _SPIKE, _REACH)
 
 
 def _cell_area(

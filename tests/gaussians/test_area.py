@@ -5,8 +5,10 @@ import torch
 from shared import alike, double, normalized, rand, randn, unit, value_error
 from torch.testing import assert_close
 
+from gaussian_swaying.gaussians import area
 from gaussian_swaying.gaussians.area import coverage_area, patch_area
 from gaussian_swaying.geometry.rotations import quat_to_rotation
+from gaussian_swaying.kernels.launch import replaces
 
 UP = double([0.0, 0.0, 1.0])
 
@@ -140,6 +142,27 @@ def test_wild_input_stays_finite_and_positive():
     assert torch.isfinite(areas).all()
     assert (areas > 0).all()
     assert coverage_area(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 3)).shape == (0,)
+
+
+@pytest.mark.skipif(not replaces((torch.ones(0).double(),), torch.float64), reason="nothing is compiled")
+@pytest.mark.parametrize("neighbours", [6, 24])
+def test_the_kernel_of_the_cells_is_their_definition(neighbours, monkeypatch):
+    flat = rand(300, 3) * double([1.0, 0.6, 0.0])
+    cluster = flat[:40] + 1e-3 * randn(40, 3)
+    above = flat[100:200] + double([0.0, 0.0, 0.03])
+    stack = flat[200:210] + double([0.0, 0.0, 1e-9])
+    means = torch.cat([flat, cluster, above, stack, 5 + 10 * rand(7, 3)])
+    normals = torch.tensor([0.0, 0.0, 1.0]) + 0.2 * randn(len(means), 3)
+    normals[-7:] = torch.eye(3)[torch.arange(7) % 3]
+    log_scales = torch.log(0.005 + 0.05 * rand(len(means), 3))
+    opacity = rand(len(means))
+    monkeypatch.setattr(area, "_CHUNK", 100)
+    found = coverage_area(means, normals, log_scales, opacity, neighbours)
+    asked = []
+    monkeypatch.setattr(area, "replaces", lambda *_: asked.append(1))
+    expected = coverage_area(means, normals, log_scales, opacity, neighbours)
+    alike(found, expected, 3e-7)  # torch divides by counts in float32
+    assert len(asked) == 5
 
 
 def test_same_input_same_areas_and_order_does_not_matter():

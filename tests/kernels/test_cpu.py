@@ -149,7 +149,7 @@ def test_a_change_of_the_translator_counts_and_one_of_another_room_does_not(fold
     monkeypatch.setattr(cpu, "__file__", str(copy / "kernels" / "cpu.py"))
     monkeypatch.setattr(cpu, "_sources", cpu._sources.__wrapped__)
     assert own() == 101.0
-    for number, file in [(1, "wind/force.py"), (2, "kernels/blocks.py")]:
+    for number, file in [(1, "gaussians/area_triton.py"), (2, "kernels/blocks.py")]:
         with (copy / file).open("a") as text:
             text.write("# a comment\n")
         assert own() == 101.0
