@@ -221,12 +221,36 @@ def _check_units(path: Path, name: str, units: str, known: tuple[str, ...]) -> N
         raise ValueError(f"`{name}` in {path} is in {units!r}, not in {known[1]}: convert it first.")
 
 
+def _of_toa5(path: Path, rows: list[list[str]]) -> list[list[str]]:
+    """The rows of a TOA5 file as those of a CSV: names with units, then seconds and velocities."""
+    if len(rows) < 4:
+        raise ValueError(f"{path} ends within the four lines of its head: export it again.")
+    known = {"TIMESTAMP": "time", "Ux": "u", "Uy": "v", "Uz": "w"}
+    wanted = [place for place, name in enumerate(rows[1]) if name in known and place < len(rows[2])]
+    units = ["s" if rows[2][place] == "TS" else rows[2][place] for place in wanted]
+    found = [[f"{known[rows[1][place]]} [{unit}]" for place, unit in zip(wanted, units, strict=True)]]
+    start: Any = None
+    for line, row in enumerate(rows[4:], start=5):
+        cells = [row[place] if place < len(row) else "" for place in wanted]
+        if "TIMESTAMP" in rows[1]:
+            at = wanted.index(rows[1].index("TIMESTAMP"))
+            try:
+                now = np.datetime64(cells[at])
+            except ValueError as error:
+                raise ValueError(f"Line {line} of {path} has no time ({error}): fill or remove it.") from error
+            start = now if start is None else start
+            cells[at] = str((now - start) / np.timedelta64(1, "s"))
+        found.append(cells)
+    return found
+
+
 def read_anemometer(path: str | os.PathLike[str]) -> tuple[list[float], list[list[float]]]:
-    """Read the time series of an anemometer: a CSV with one line of names.
+    """Read the time series of an anemometer: a CSV with one line of names, or a logger's TOA5 file.
 
     Its columns are ``time [s]``, and either ``u [m/s]``, ``v [m/s]`` and perhaps ``w [m/s]`` (along x, y and z), or
     ``speed [m/s]`` and ``direction [deg]`` (from which the wind blows, clockwise from north, where y is north and x is
-    east). The units may be left out, but others are an error. Other columns are ignored.
+    east). The units may be left out, but others are an error. Other columns are ignored. A TOA5 file (Campbell
+    Scientific) has ``TIMESTAMP`` and ``Ux``, ``Uy`` and ``Uz``, along x, y and z; its first record is time zero.
 
     Returns:
         Times [s] and velocities [m/s], z up.
@@ -237,6 +261,9 @@ def read_anemometer(path: str | os.PathLike[str]) -> tuple[list[float], list[lis
             rows = [row for row in csv.reader(file) if any(cell.strip() for cell in row)]
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path} is not a CSV in UTF-8 ({error}): export it again.") from error
+    head = 1  # lines before the measurements
+    if rows and rows[0][0] == "TOA5":
+        rows, head = _of_toa5(path, rows), 4
     known = {"time": ("", "s"), "direction": ("", "deg", "°"), **dict.fromkeys(("u", "v", "w", "speed"), ("", "m/s"))}
     columns: dict[str, int] = {}
     for number, cell in enumerate(rows[0] if rows else []):
@@ -256,7 +283,7 @@ def read_anemometer(path: str | os.PathLike[str]) -> tuple[list[float], list[lis
             )
     wanted = [*needed, *(["w"] if "w" in columns else [])]
     times, flows = [], []
-    for line, row in enumerate(rows[1:], start=2):
+    for line, row in enumerate(rows[1:], start=head + 1):
         try:
             numbers = [float(row[columns[name]]) for name in wanted]
         except (ValueError, IndexError):

@@ -255,7 +255,27 @@ def test_an_anemometer(tmp_path):
     np.testing.assert_allclose(flows, [[4, 0, 0], [0, -2, 0], [-root, -root, 0]], atol=1e-12)
 
 
+TOA5 = """"TOA5","6843","CR3000","1","std","program","2","above"
+"TIMESTAMP","RECORD","Ux","Uy","Uz","Ts"
+"TS","RN","m/s","m/s","m/s","C"
+"","","Smp","Smp","Smp","Smp"
+"2012-06-07 23:59:59.95",7,1.5,-2,0.25,27
+"2012-06-08 00:00:00",8,2.5,-1,-0.5,27.1
+"""
+
+
+def test_a_logger_of_campbell_scientific(tmp_path):
+    times, flows = read_anemometer(_csv(tmp_path / "a.dat", TOA5))
+    assert times == [0.0, 0.05]  # over midnight
+    assert flows == [[1.5, -2.0, 0.25], [2.5, -1.0, -0.5]]
+
+
 BAD_LINES = {
+    TOA5.replace('"2012-06-08 00:00:00"', '"midnight"'): "Line 6 of .* has no time",
+    TOA5.replace("2.5,-1", '"NAN",-1'): "Line 6 of .* has no number",
+    TOA5.replace('"m/s","m/s","m/s"', '"knots","m/s","m/s"'): r"`u` in .* is in 'knots'",
+    "\n".join(TOA5.splitlines()[:3]): "ends within the four lines of its head",
+    TOA5.replace("Ux", "wind"): r"has no column `u \[m/s\]`",
     "time,u [km/h],v\n0,1,2\n": r"`u` in .* is in 'km/h', not in m/s",
     "time [ms],u,v\n0,1,2\n": r"`time` in .* is in 'ms', not in s",
     "time,u,v,U [m/s]\n0,1,2,3\n": "has two columns `u`",
