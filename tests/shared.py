@@ -9,7 +9,6 @@ from contextlib import contextmanager
 
 import pytest
 import torch
-from torch import Tensor, nn
 from torch.testing import assert_close
 
 from gaussian_swaying import Box, MaterialPoints
@@ -204,19 +203,6 @@ def turned_by(degrees):
     """The rotation about z, float64."""
     s, c = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
     return double([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-class Means(nn.Module):
-    """A network in place of I3D: the mean of each channel and frame."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        return x.mean(dim=[3, 4]).flatten(1)
-
-
-def small_network(path):
-    """Such a network as TorchScript at a path, which is returned."""
-    torch.jit.script(Means()).save(str(path))
-    return path
 
 
 def rows(path):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from torch import Tensor
@@ -14,7 +14,6 @@ TURNED_AXES = (
     "z forward) or opengl (y up, z backward, as without it)"
 )
 _SAMPLE = 1000  # points that are looked at
-_PHOTOS = 8
 
 
 def places_in_picture(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
@@ -45,28 +44,3 @@ def cameras_that_see(points: Tensor, cameras: Sequence[Camera]) -> tuple[int, in
 def turned_axes(world_to_camera: Tensor) -> Tensor:
     """A pose (4, 4) with the camera's y and z flipped: between OpenGL's and OpenCV's axes."""
     return world_to_camera * world_to_camera.new_tensor([1.0, -1.0, -1.0, 1.0])[:, None]
-
-
-def turned_as_points(
-    cameras: Sequence[Camera], load: Callable[[int, bool], Tensor], points: Tensor, colors: Tensor
-) -> bool | None:
-    """Whether rotating the photos by their EXIF tags makes them agree better with the colours of points.
-
-    Args:
-        load: Reads the photo of an index as it is stored, or turned: dtype uint8, shape (H, W, 3 or 4).
-        points: Points of the capture [scene units], shape (P, 3).
-        colors: Their colours in 0 to 1, shape (P, 3).
-
-    Returns:
-        The answer; None if the colours do not tell.
-    """
-    step = -(-len(points) // _SAMPLE)
-    errors = [0.0, 0.0]
-    for index, camera in enumerate(cameras[:_PHOTOS]):
-        place, inside = places_in_picture(points[::step], camera)
-        if bool(inside.any()):
-            column, row = place[inside].long().unbind(-1)
-            for turned in (False, True):
-                seen = load(index, turned)[row, column, :3].float() / 255
-                errors[turned] += float((seen - colors[::step][inside]).abs().mean())
-    return errors[1] < errors[0] if min(errors) < 0.8 * max(errors) else None

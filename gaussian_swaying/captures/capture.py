@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._checks import check_choice, check_whole
-from gaussian_swaying.captures.agreement import TURNED_AXES, cameras_that_see, turned_as_points
+from gaussian_swaying.captures.agreement import TURNED_AXES, cameras_that_see
 from gaussian_swaying.captures.colmap import colmap_models, read_colmap_points, read_colmap_views
 from gaussian_swaying.captures.images import PosedImage, check_image_size, image_head, load_image
 from gaussian_swaying.captures.lens import Lens
@@ -150,11 +150,7 @@ def read_capture(
     views = [replace(view, camera=replace(view.camera, near=NEAR * extent)) for view in views]
     if files.points is not None:
         _check_sight(root, views, files.points.points, read_axes=files.source.startswith("transforms"))
-    unsure = [k for k, (_, told) in enumerate(both) if not told]
-    turned = _turned(views, unsure, files.points)
-    for k in unsure if turned else ():
-        views[k] = replace(views[k], turned=True)
-
+    unsure = [view for view, (_, told) in zip(views, both, strict=True) if not told]
     masks = [item.mask for item in posed if item.mask is not None]
     beside = photos_beside(files.folder, [item.path for item in posed], masks)
     found = [
@@ -178,9 +174,9 @@ def read_capture(
             f"left out {len(beside)} of {len(beside) + len(posed)} photos on disk that have no camera in {files.source}"
             f", the first of them {beside[0]}: find their cameras, or remove them"
         )
-    if unsure and turned is None:
+    if unsure:
         lacks.append(
-            f"{len(unsure)} photos have an EXIF tag that turns them, the first of them {views[unsure[0]].image_path}, "
+            f"{len(unsure)} photos have an EXIF tag that turns them, the first of them {unsure[0].image_path}, "
             "and nothing tells whether their cameras know: they are read as they are stored; turn their pixels, or "
             "remove the tag"
         )
@@ -264,15 +260,6 @@ def _check_sight(root: Path, views: Sequence[View], points: Tensor, read_axes: b
             f"Only {seen} of {len(views)} cameras of {root} see any of its points: "
             f"{TURNED_AXES if read_axes and 2 * turned >= len(views) else cause}."
         )
-
-
-def _turned(views: Sequence[View], unsure: Sequence[int], points: PointCloud | None) -> bool | None:
-    """Whether photos whose sizes do not tell are to be turned as their EXIF tags say; None if points do not tell."""
-    if points is None or not unsure:
-        return None
-    some = [views[k] for k in unsure]
-    cameras = [view.camera for view in some]
-    return turned_as_points(cameras, lambda k, on: replace(some[k], turned=on).load(), points.points, points.colors)
 
 
 def nearest_to_axes(cameras: Sequence[Camera]) -> Tensor:

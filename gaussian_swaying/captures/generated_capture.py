@@ -9,7 +9,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 import torch.nn.functional as functional
 from einops import rearrange
@@ -109,20 +108,6 @@ class GeneratedCapture:
         shade = 0.4 + 0.6 * (self.normals(x, z) @ light).abs()
         return (pattern * ((0.8 + 0.2 * checks + 0.12 * weave) * shade)[..., None]).clamp(0, 1)
 
-    def mesh(self, columns: int = 240, rows: int = 160) -> tuple[Tensor, Tensor, Tensor]:
-        """The sheet as ``columns`` x ``rows`` squares, cut into triangles.
-
-        Returns:
-            Vertices [m], float64, shape (V, 3), their colours in 0 to 1, shape (V, 3), and triangles, shape (T, 3).
-        """
-        x = torch.linspace(0, self.width, columns + 1, dtype=torch.float64)
-        z = torch.linspace(0, self.height, rows + 1, dtype=torch.float64)
-        gx, gz = (grid.reshape(-1) for grid in torch.meshgrid(x, z, indexing="ij"))
-        corner = (torch.arange(columns)[:, None] * (rows + 1) + torch.arange(rows)).reshape(-1)
-        across, above, both = corner + rows + 1, corner + 1, corner + rows + 2
-        faces = torch.cat([torch.stack([corner, across, both], -1), torch.stack([corner, both, above], -1)])
-        return torch.stack([gx, self.elevation(gx, gz), gz], -1), self.colors(gx, gz).float(), faces
-
     # ---- the pictures
 
     def cameras(self) -> list[Camera]:
@@ -201,12 +186,11 @@ class GeneratedCapture:
     # ---- files
 
     def write(self, folder: str | os.PathLike[str], threads: int = 2) -> Path:
-        """Write the capture: ``images/``, ``transforms.json`` and ``mesh.ply``.
+        """Write the capture: ``images/`` and ``transforms.json``.
 
         Images are PNG with alpha; colours are not multiplied with it. ``transforms.json`` is written last.
         """
         from imageio.v3 import imwrite
-        from plyfile import PlyData, PlyElement
 
         folder = Path(folder)
         if folder.exists() and any(folder.iterdir()):
@@ -225,20 +209,8 @@ class GeneratedCapture:
 
         with ThreadPoolExecutor(max(threads, 1)) as pool:
             frames = list(pool.map(draw, range(self.views)))
-        vertices, colors, faces = self.mesh()
-        rows = np.zeros(len(vertices), dtype=[(n, "<f4") for n in "xyz"] + [(n, "u1") for n in _RGB])
-        shades = (colors * 255).round().to(torch.uint8)
-        for column, axis in enumerate("xyz"):
-            rows[axis], rows[_RGB[column]] = vertices[:, column].numpy(), shades[:, column].numpy()
-        triangles = np.zeros(len(faces), dtype=[("vertex_indices", "<i4", (3,))])
-        triangles["vertex_indices"] = faces.numpy()
-        elements = [PlyElement.describe(rows, "vertex"), PlyElement.describe(triangles, "face")]
-        PlyData(elements, byte_order="<").write(str(folder / "mesh.ply"))
         focal = float(cameras[0].intrinsics[0, 0])
         fields: dict[str, object] = {"camera_angle_x": math.radians(self.fov), "fl_x": focal, "fl_y": focal}
         fields |= {"cx": 0.5 * self.size, "cy": 0.5 * self.size, "w": self.size, "h": self.size, "frames": frames}
         (folder / "transforms.json").write_text(json.dumps(fields, indent=1), encoding="utf-8")
         return folder
-
-
-_RGB = ("red", "green", "blue")

@@ -101,11 +101,11 @@ def export(options: argparse.Namespace) -> None:
     """Convert, and report the file."""
     if options.player:
         return print("\n".join(f"wrote {path}" for path in write_player(Path(options.source))))
-    film = options.web or Path(options.target or "").suffix == ".sway"
-    if options.target is None and not film:
+    plays = options.web or Path(options.target or "").suffix == ".sway"
+    if options.target is None and not plays:
         raise ValueError(f"Expected a file to write, whose name ends in one of {', '.join(endings(written=True))}.")
-    what = "a film" if film else "the frames of a run" if Path(options.source).is_dir() else "a splat"
-    format = None if film else FORMATS[format_of(options.target)]
+    what = "a film" if plays else "the frames of a run" if Path(options.source).is_dir() else "a splat"
+    format = None if plays else FORMATS[format_of(options.target)]
     known = () if format is None else (*format.options, "apart", "fps", "box", *(["up"] if format.in_metres else []))
     known = (*known, "bones") if format is FORMATS["glb"] else known
     for name in ("up", "metres_per_unit", "spz_version", "apart", "fps", "box", "bones"):
@@ -114,7 +114,11 @@ def export(options: argparse.Namespace) -> None:
             raise ValueError(f"--{name.replace('_', '-')} is not for {what}{where}: leave it out.")
     place: dict[str, Any] = {"spz_version": options.spz_version or 3}
     if format is None:
-        export_web(options)
+        target = Path(options.target or Path(options.source) / "film.html")
+        film = write_film(Path(options.source), target)
+        print("".join(f"note: {note}\n" for note in film.notes), end="")
+        print("{count:,} Gaussians, {frames:,} frames of {nodes:,} nodes".format(**film.head))
+        print(f"wrote {target} ({target.stat().st_size / 1e6:.1f} MB)")
     elif what == "a splat":
         metres = 1.0 if options.metres_per_unit is None else options.metres_per_unit
         check_positive("--metres-per-unit", metres)
@@ -189,16 +193,4 @@ def export_bones(
     print(f"{options.bones} bones, {error:.2%} of the motion missed")
     if cloud.sh_degree:
         print("note: colours that depend on the direction of view are the same from all sides.")
-    print(f"wrote {target} ({target.stat().st_size / 1e6:.1f} MB)")
-
-
-def export_web(options: argparse.Namespace) -> None:
-    """Write the film of a run, and report its size."""
-    run = Path(options.source)
-    target = run / "film.html" if options.target is None else Path(options.target)
-    film = write_film(run, target)
-    if film.notes:
-        print("\n".join(f"note: {note}" for note in film.notes))
-    head = film.head
-    print(f"{head['count']:,} Gaussians, {head['frames']:,} frames of {head['nodes']:,} nodes")
     print(f"wrote {target} ({target.stat().st_size / 1e6:.1f} MB)")

@@ -32,23 +32,11 @@ def build_options() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("--host", default="127.0.0.1", help="address to listen on; 0.0.0.0 lets other computers in (default: this one)")
-    add(
-        "--allow-host",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="a name or an address by which other computers open the page, if it is none of this computer's own; "
-        "can be given several times",
-    )
+    host = "a further name or address by which other computers open the page; can be given several times"
+    add("--allow-host", action="append", default=[], metavar="NAME", help=host)
     add("--port", type=int, default=8080, help="port of the page; the next free one if it is taken")
-    add(
-        "--grid",
-        default="real-time",
-        choices=("real-time", "configured"),
-        help="real-time: a short trial at the start chooses the finest grid, not finer than the configured one, that "
-        "this machine simulates in real time; configured: that of the configuration, as with --solver.dx (default: "
-        "real-time)",
-    )
+    grid = "real-time: the finest that a short trial simulates in real time (default); configured: as it is"
+    add("--grid", default="real-time", choices=("real-time", "configured"), help=grid)
     add("--pixels", type=int, default=1920, help="most pixels of the longer side of a picture")
     add("--no-browser", action="store_true", help="only print the address")
     return parser

@@ -90,17 +90,11 @@ def _stop(number: int, frame: object) -> NoReturn:
 
 
 def _imported(name: str) -> ModuleType:
-    """A module; while it is imported, and later within it, Python looks for no garbage, which would take 0.3 s.
-
-    What torch and numpy would not explain while they are loaded is checked before.
-    """
+    """A module; while it is imported, and later within it, Python looks for no garbage, which would take 0.3 s."""
     try:
         os.getcwd()
-        int(os.environ.get("SOURCE_DATE_EPOCH", 0))
     except FileNotFoundError:
         _end("The working directory no longer exists: change to another one.")
-    except ValueError:
-        _end("The environment variable SOURCE_DATE_EPOCH is not a whole number of seconds: correct or unset it.")
     if name not in sys.modules:
         main_thread = threading.current_thread() is threading.main_thread()
         stops = main_thread and signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -18,7 +18,6 @@ from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.config.material_names import NAMES
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.measures import DIRECTIONS
-from gaussian_swaying.gaussians.repair import OPAQUE_LOGIT
 from gaussian_swaying.geometry.origin import counted_from
 from gaussian_swaying.simulation.measure import duration
 from gaussian_swaying.simulation.simulation import Simulation
@@ -113,11 +112,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> list[str]:
     _write_numbers(folder, cost, splat=str(options.scene), suggestion=told)
     names = ["preview.json", "preview.png", *(["things.png"] if things is not None else []), *names]
     degree = "only constant colours were read" if _large(Path(options.scene)) else f"SH degree {cloud.sh_degree}"
-    infinite = int((cloud.opacities.abs() == OPAQUE_LOGIT).sum())
     lines = [f"{options.scene}: {len(cloud):,} Gaussians{f', {degree}' if options.verbose else ''}"]
-    if infinite:
-        note = f"the opacity of {infinite:,} is exactly 0 or 1, an infinite logit, which is read as ±{OPAQUE_LOGIT:g}"
-        lines.append(f"  note: {note}")
     if any(cloud.origin):
         lines.append(f"  origin          {counted_from(cloud.origin)}")
     lines += things_lines(found) if options.verbose else [line for line in things_lines(found) if " moves " in line]

@@ -31,37 +31,15 @@ def build_parser() -> argparse.ArgumentParser:
     add("--resume", action="store_true", help="do what is missing in the folder; complete runs are never done again")
     add("--workers", type=int, help="runs at a time, each in a process; one per GPU or core if left out")
     add("--threads", type=int, help="threads of each run; cores / workers if left out")
-    add(
-        "--retries",
-        type=int,
-        default=1,
-        help="how often a failed run is tried again; three times as often if its process was killed",
-    )
+    add("--retries", type=int, default=1, help="how often a failed run is tried again; thrice that if it was killed")
     add("--device", **DEVICE)
-    add(
-        "--together",
-        type=int,
-        default=1,
-        metavar="N",
-        help="simulate up to N runs of equal shape as one, which a GPU does many times faster if they are small; they "
-        "then take substeps of the same length",
-    )
-    add("--per-gpu", type=int, default=1, metavar="N", help="jobs at a time on each GPU")
-    add(
-        "--ray",
-        nargs="?",
-        const="local",
-        metavar="ADDRESS",
-        help="let Ray do the runs, on this machine or on the cluster at an address; needs gaussian-swaying[ray]",
-    )
+    together = "simulate up to N runs of equal shape as one, with substeps of the same length: faster on a GPU"
+    add("--together", type=int, default=1, metavar="N", help=together)
+    ray = "let Ray do the runs, on this machine or on the cluster at an address; needs gaussian-swaying[ray]"
+    add("--ray", nargs="?", const="local", metavar="ADDRESS", help=ray)
     add("--parquet", action="store_true", help="also write sweep.parquet; needs gaussian-swaying[parquet]")
-    add(
-        "--shards",
-        type=int,
-        metavar="N",
-        help="also write the runs as WebDataset shards, N runs in each; needs gaussian-swaying[webdataset]",
-    )
-    add("--picture", default="last", choices=("last", "middle"), help="frame of the contact sheet")
+    shards = "also write WebDataset shards with N runs in each; needs gaussian-swaying[webdataset]"
+    add("--shards", type=int, metavar="N", help=shards)
     add("--list", action="store_true", help="print the runs and end")
     return parser
 
@@ -70,17 +48,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Parse and sweep."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     parser = build_parser()
-    begun: list[Path] = []
-
-    def advice(error: BaseException) -> str | None:
-        return f"To do what is missing:\n  {command(arguments, '--resume')}" if begun else None
-
     return run_command(
-        lambda: sweep(parser.parse_args(arguments), begun, arguments),
-        stopped="Stopped; complete runs are kept, and those that were running continue from their last frame.",
+        lambda: sweep(parser.parse_args(arguments), arguments),
+        stopped="Stopped; complete runs are kept, and those that were running continue from their last frame. To do "
+        f"what is missing:\n  {command(arguments, '--resume')}",
         memory=MEMORY,
         arguments=arguments,
-        advice=advice,
     )
 
 
@@ -92,8 +65,8 @@ def explain(error: BaseException) -> str:
     return f"{type(error).__name__}: {first_line(error)} This is a bug; its traceback is in the folder logs."
 
 
-def sweep(options: argparse.Namespace, begun: list[Path], arguments: Sequence[str]) -> int:
-    """Do the runs that are missing, and report; the folder is put into ``begun`` once it is the sweep's."""
+def sweep(options: argparse.Namespace, arguments: Sequence[str]) -> int:
+    """Do the runs that are missing, and report."""
     from gaussian_swaying.sweeps.dataset import SHARDS, write_shards
     from gaussian_swaying.sweeps.plan import make_plan, read_sweep
     from gaussian_swaying.sweeps.record import PARQUET, TABLE
@@ -111,18 +84,9 @@ def sweep(options: argparse.Namespace, begun: list[Path], arguments: Sequence[st
             print(f"{name}  {', '.join(f'{axis} {value}' for axis, value in run.items())}")
         return 0
     folder = Path(options.output or Path("outputs") / "sweeps" / file.stem)
+    others = {name: value for name, value in vars(options).items() if name not in ("sweep", "output", "shards", "list")}
     with stop_signals():
-        results = run_sweep(
-            plan,
-            folder,
-            explain=explain,
-            started=lambda: begun.append(folder),
-            **{
-                name: value
-                for name, value in vars(options).items()
-                if name not in ("sweep", "output", "shards", "list")
-            },
-        )
+        results = run_sweep(plan, folder, explain=explain, **others)
     counts = Counter(result["status"] for result in results.values())
     print(f"{len(results)} runs: {', '.join(f'{count} {status}' for status, count in sorted(counts.items()))}")
     wrote = [folder / "runs", folder / TABLE, *sorted(folder.glob("contact_sheet*.png"))]

@@ -20,6 +20,7 @@ from gaussian_swaying import _program as program
 from gaussian_swaying._yaml_limits import limit_yaml
 from gaussian_swaying.cli.errors import command, guessing, run_command
 from gaussian_swaying.cli.shipped import with_shipped
+from gaussian_swaying.config.gone import refuse_gone
 from gaussian_swaying.config.material_names import with_named_materials
 from gaussian_swaying.config.parser import with_lists
 from gaussian_swaying.runs.signals import stop_signals
@@ -40,7 +41,7 @@ def make_cli(arguments: Sequence[str] | None = None, run: bool = True, run_folde
     Args:
         arguments: Command line; that of the process if None.
     """
-    limit_yaml(with_named_materials)
+    limit_yaml(lambda found: with_named_materials(refuse_gone(found)))
     given = with_lists(with_shipped(sys.argv[1:] if arguments is None else arguments, "train"))
     kwargs = {"prog": program.name("train"), "exit_on_error": False}
     return _Command(

@@ -44,6 +44,11 @@ GONE = {
     "fit.fit_share": "`until`, a time [s]",
     "fit.starts": "nothing: three starts go on",
     "fit.seed": "nothing: the search is always the same",
+    "PhysGaussianCamera": "OrbitCamera, or another camera",
+    "DepthNormalLoss": "MultiViewGeometricLoss",
+    "AnisotropyLoss.ratio": "the default, the paper's",
+    "PhotometricLoss.padding": "the default, windows inside the picture",
+    "DefaultDensification.reset_opacity": "nothing, as no recipe did it",
     "FlagOnStandScene": "FlagScene with `stand: pole`",
 }
 """What to use in place of classes, fields of classes (``Class.field``) and other fields (``scene.field``)."""

@@ -1,4 +1,4 @@
-"""Comparison of a run with a reference, frame by frame: pictures, surface and, with a network, video."""
+"""Comparison of a run with a reference, frame by frame: pictures and surface."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
-from einops import rearrange
 from torch import Tensor
 from tqdm import tqdm
 
@@ -29,9 +28,6 @@ from gaussian_swaying.metrics.nearest import nearest_distances
 from gaussian_swaying.metrics.ssim import SSIM_TAPS, ssim_map
 from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.recording.video import VideoEncoder
-
-if TYPE_CHECKING:
-    from gaussian_swaying.metrics.frechet_video import FrechetVideoDistance
 
 
 def _errors(image: Tensor, target: Tensor) -> dict[str, Tensor]:
@@ -53,7 +49,6 @@ def compare_run(
     points: int = 10_000,
     seed: int = 0,
     device: str | torch.device = "cpu",
-    fvd: FrechetVideoDistance | None = None,
     video: str | os.PathLike[str] | None = None,
     progress: bool = False,
 ) -> dict[str, Any]:
@@ -78,7 +73,6 @@ def compare_run(
         points: Number of points on the reference's surface, and largest number of particles.
         seed: Seed of the points.
         device: Device on which the metrics are computed.
-        fvd: Computes the Fréchet video distance; None for none. It is reset first.
         video: An .mp4 of reference, run and error side by side; None for none.
         progress: Show a progress bar.
 
@@ -86,7 +80,7 @@ def compare_run(
         The content of ``eval.json``: ``mean`` and ``worst`` over the frames and ``per_frame``, with ``psnr_db``,
         ``ssim``, ``mse``, ``chamfer_m`` and its two terms ``run_to_reference_m`` and ``reference_to_run_m``;
         ``psnr_of_mean_db``, the PSNR of the mean square over all frames; ``chamfer_share``, the mean Chamfer distance
-        over ``side_m``; ``fvd`` with its protocol; ``skipped``, what was not compared and why; sizes, numbers, seed,
+        over ``side_m``; ``skipped``, what was not compared and why; sizes, numbers, seed,
         device and versions. What is not finite is None.
 
     Raises:
@@ -124,16 +118,6 @@ def compare_run(
     count = _common_count(run, reference, counts, first, first_reference, frames)
     run_pictures, pictures = run_pictures[first:][:count], pictures[first_reference:][:count]
     size = _common_size(run, reference, run_pictures, pictures) if with_pictures else None
-    if fvd is not None:
-        if not with_pictures:
-            raise ValueError(f"The Fréchet video distance needs pictures ({skipped[0]}): remove its network.")
-        if count < fvd.clip_length + fvd.stride:
-            raise ValueError(
-                f"Two clips of {fvd.clip_length} frames need {fvd.clip_length + fvd.stride} frames, but {count} are "
-                "compared: lower `clip_length`, or remove the network."
-            )
-        fvd.to(device)
-        fvd.reset()
     surface = None if cloth is None else _Surface(run, summary, cloth, first_reference, points, seed, device)
 
     encoder = None
@@ -141,37 +125,28 @@ def compare_run(
         encoder = VideoEncoder(Path(video), 1 / float(summary.get("frame_dt_s") or 0.04))
 
     @torch.inference_mode()
-    def compared(number: int) -> tuple[dict[str, Any], np.ndarray | None, list[Tensor]]:
-        """The numbers of a frame, its picture for the video, and what the network gets: reference and run."""
+    def compared(number: int) -> tuple[dict[str, Any], np.ndarray | None]:
+        """The numbers of a frame, and its picture for the video."""
         row: dict[str, Any] = {"frame": first + number, "reference_frame": first_reference + number}
-        film, small = None, []
+        film = None
         if with_pictures:
             image, target = (_read_frame(files[number], device) for files in (run_pictures, pictures))
             row |= _errors(image, target)
             if encoder is not None:
                 labels = (f"reference, frame {row['reference_frame']}", f"run, frame {row['frame']}")
                 film = comparison_picture(target, image, labels)
-            if fvd is not None:
-                small = [fvd.prepare(rearrange(picture, "h w c -> c h w")) for picture in (target, image)]
         if surface is not None:
             row |= surface.distances(first + number, first_reference + number)
-        return row, film, small
+        return row, film
 
     rows: list[dict[str, Any]] = []
-    prepared: list[list[Tensor]] = []
     try:
         # reading and writing pictures takes longer than comparing them
         done = in_threads(compared, range(count), threads=min(8, os.cpu_count() or 1))
-        for row, film, small in tqdm(done, total=count, unit="frame", disable=not progress, file=sys.stderr):
+        for row, film in tqdm(done, total=count, unit="frame", disable=not progress, file=sys.stderr):
             if encoder is not None and film is not None:
                 encoder.write(film)
-            prepared += [small] if small else []
             rows.append(row)
-        video_distance: dict[str, Any] | None = None
-        if fvd is not None:
-            for real, pile in zip((True, False), zip(*prepared, strict=True), strict=True):
-                fvd.update(torch.stack(pile), real=real)
-            video_distance = {"fvd": float(fvd.compute()), **fvd.protocol()}
         if encoder is not None:
             encoder.finish()
     finally:
@@ -193,7 +168,6 @@ def compare_run(
         "size": None if size is None else list(size),
         "mean": mean,
         "worst": worst,
-        "fvd": video_distance,
         "skipped": skipped,
         "seed": seed,
         "device": describe_device(device),
@@ -209,50 +183,15 @@ def compare_run(
 
 
 def table(result: dict[str, Any]) -> str:
-    """The numbers of :func:`compare_run` as Markdown that is also readable as plain text."""
+    """The numbers of :func:`compare_run` as Markdown that is also readable as plain text; None is infinite."""
     mean, worst = result["mean"], result["worst"]
-    rows: list[tuple[str, str, str]] = []
-    if "psnr_db" in mean:
-        rows.append(("PSNR [dB]", _number(mean["psnr_db"], ".2f"), _number(worst["psnr_db"], ".2f")))
-        rows.append(("PSNR of the mean square [dB]", _number(result["psnr_of_mean_db"], ".2f"), ""))
-        rows.append(("SSIM", _number(mean["ssim"], ".4f"), _number(worst["ssim"], ".4f")))
-    if "chamfer_m" in mean:
-        side = result["side_m"]
-        for label, name in (
-            ("Chamfer distance, average of both directions", "chamfer_m"),
-            ("run to reference", "run_to_reference_m"),
-            ("reference to run", "reference_to_run_m"),
-        ):
-            rows.append((f"{label} [mm]", _number(1e3 * mean[name], ".2f"), _number(1e3 * worst[name], ".2f")))
-            if side and name == "chamfer_m":
-                shares = [_number(1e2 * value[name] / side, ".2f") for value in (mean, worst)]
-                rows.append((f"the same / longer side of {side:g} m [%]", shares[0], shares[1]))
-        rows.append(("of two random samples of the reference [mm]", _number(1e3 * result["sampling_m"], ".2f"), ""))
-    if result["fvd"] is not None:
-        rows.append(("FVD", _number(result["fvd"]["fvd"], ".5g"), ""))
-    header = ("", f"mean of {result['frames']} frames", "worst frame")
-    widths = [max(len(row[column]) for row in (header, *rows)) for column in range(3)]
-    lines = [_line(header, widths), f"|{'-' * (widths[0] + 2)}|{'-' * (widths[1] + 1)}:|{'-' * (widths[2] + 1)}:|"]
-    lines += [_line(row, widths) for row in rows]
-    lines += ["", f"Run `{result['run']}`, reference `{result['reference']}`: frame 0 of the run belongs to frame "]
-    lines[-1] += f"{result['reference_offset']} of the reference."
-    if result["size"]:
-        lines += [f"Pictures of {result['size'][0]} x {result['size'][1]} pixels."]
-    if "chamfer_m" in mean:
-        lines += [
-            f"Surfaces: {result['reference_points']} points of the reference, {result['run_points']} of "
-            f"{result['particles']} particles of the run, seed {result['seed']}."
-        ]
-        if not result["side_m"]:
-            lines += ["The longer side is not known, so distances are not given as shares of it: set it with --side."]
-    if result["fvd"] is not None:
-        lines += [
-            "FVD: " + ", ".join(f"{name} {value}" for name, value in result["fvd"].items() if name != "fvd") + "."
-        ]
-    lines += [f"Not compared: {reason}." for reason in result["skipped"]]
-    software = ", ".join(f"{name} {number}" for name, number in result["versions"].items())
-    lines += [f"Computed on {result['device']}; {software}."]
-    return "\n".join(lines) + "\n"
+    width = max(map(len, mean))
+    lines = [f"| {'':{width}} |        mean | worst frame |", f"|{'-' * (width + 2)}|------------:|------------:|"]
+    for name in mean:
+        cells = ("infinite" if value is None else f"{value:.5g}" for value in (mean[name], worst[name]))
+        lines.append(f"| {name:{width}} | {' | '.join(f'{cell:>11}' for cell in cells)} |")
+    told = {name: value for name, value in result.items() if name not in ("mean", "worst", "per_frame")}
+    return "\n".join([*lines, "", *(f"{name}: {value}" for name, value in told.items() if value is not None)]) + "\n"
 
 
 def evaluate(
@@ -420,11 +359,3 @@ def _read_frame(path: Path, device: torch.device) -> Tensor:
     if pixels.shape[-1] != 3:
         raise ValueError(f"The picture {path} has transparent pixels: render it over its background.")
     return pixels.to(device).float() / 255
-
-
-def _number(value: float | None, form: str) -> str:
-    return "infinite" if value is None else format(value, form)
-
-
-def _line(cells: Sequence[str], widths: Sequence[int]) -> str:
-    return f"| {cells[0]:<{widths[0]}} | {cells[1]:>{widths[1]}} | {cells[2]:>{widths[2]}} |"

@@ -12,7 +12,6 @@ from torch import Tensor
 Array: TypeAlias = np.ndarray | Tensor
 
 MOVES = 0.1  # a point moves if its largest displacement is over this share of the scale of all
-PARTS = 8
 FEWEST = 8  # frames
 
 
@@ -33,12 +32,8 @@ class SwayScore:
         peak_share: Share of the power above 0.05 Hz that lies between 2/3 and 4/3 of ``peak``.
         drift: Change of the mean displacement of the top from the first half of the time to the second, over that
             length that ``lean`` is a share of: a thing that still creeps.
-        together: Mean correlation of the fluctuation along the main axis between eight clusters of the moving points.
-            1 is a thing that rocks as one piece. Clusters that fluctuate less than 5 % of ``sway`` are left out; NaN if
-            fewer than two are left.
         cross: Minor over major axis of the fluctuation of the mean of the top, by its two largest standard deviations.
             Nature's is some 0.4 to 0.9; a sine along one line has 0.
-        still: Largest displacement of the points said to be still, at any time, over the side; NaN if none are.
         stiller: Median of the largest displacements of the points that do not move, over the side; 0 if all move.
         moving_share: Share of the points that move.
         side: The side [unit of the positions].
@@ -50,24 +45,19 @@ class SwayScore:
     peak: float
     peak_share: float
     drift: float
-    together: float
     cross: float
-    still: float
     stiller: float
     moving_share: float
     side: float
 
 
-def sway_score(
-    rest: Array, displacement: Array, times: Array, still: Array | None = None, skip: float = 2.0
-) -> SwayScore:
+def sway_score(rest: Array, displacement: Array, times: Array, skip: float = 2.0) -> SwayScore:
     """Measure whether a thing sways, or leans, rocks, trembles or creeps.
 
     Args:
         rest: Positions of points at rest, in any unit, shape (N, 3).
         displacement: Displacements from there in each frame, shape (T, N, 3).
         times: Times of the frames, evenly spaced [s], shape (T,).
-        still: Mask (N,) of the points that should not move, such as pinned ones; None if none are known.
         skip: Time before which frames are ignored, as the wind still pushes the thing over [s].
 
     Returns:
@@ -89,7 +79,7 @@ def sway_score(
     moving = farthest > MOVES * np.quantile(farthest, 0.98)
     if not moving.any():
         nan = math.nan
-        return SwayScore(0.0, 0.0, nan, nan, nan, nan, nan, nan, nan, 0.0, 0.0, nan)
+        return SwayScore(0.0, 0.0, nan, nan, nan, nan, nan, 0.0, 0.0, nan)
     low, high = np.quantile(rest[moving], [0.01, 0.99], axis=0)
     side = max(float((high - low).max()), np.finfo(np.float64).tiny)
 
@@ -104,9 +94,8 @@ def sway_score(
 
     of_top = moved[:, top].mean(axis=1)
     first, second = np.split(of_top, [len(of_top) // 2])
-    along, spreads, axes = np.linalg.svd(of_top - of_top.mean(axis=0), full_matrices=False)
+    along, spreads, _ = np.linalg.svd(of_top - of_top.mean(axis=0), full_matrices=False)
     peak, share = _peak(along[:, 0] * spreads[0], step)
-    told = None if still is None else farthest[_numbers(still).astype(bool)]
     return SwayScore(
         lean=leaning / side,
         sway=swaying / side,
@@ -114,9 +103,7 @@ def sway_score(
         peak=peak,
         peak_share=share,
         drift=float(np.linalg.norm(second.mean(axis=0) - first.mean(axis=0))) / leaning,
-        together=_together(rest[moving], fluctuation @ axes[0], least=0.05 * swaying),
         cross=float(spreads[1] / spreads[0]) if spreads[0] > 0 else 0.0,
-        still=float(told.max()) / side if told is not None and len(told) else math.nan,
         stiller=float(np.median(farthest[~moving])) / side if not moving.all() else 0.0,
         moving_share=float(moving.mean()),
         side=side,
@@ -152,16 +139,3 @@ def _peak(line: np.ndarray, step: float) -> tuple[float, float]:
     near = (frequency > peak * 2 / 3) & (frequency < peak * 4 / 3)
     total = float(power[frequency > 0.05].sum())
     return peak, float(power[near].sum()) / total if total > 0 else math.nan
-
-
-def _together(rest: np.ndarray, lines: np.ndarray, least: float) -> float:
-    from scipy.cluster.vq import kmeans2
-
-    if len(rest) < PARTS:
-        return math.nan
-    _, part = kmeans2(rest, PARTS, seed=0, minit="++")
-    means = [lines[:, part == number].mean(axis=1) for number in range(PARTS) if (part == number).sum() > 5]
-    means = [line for line in means if line.std() > least]
-    if len(means) < 2:
-        return math.nan
-    return float(np.corrcoef(means)[np.triu_indices(len(means), k=1)].mean())

@@ -32,8 +32,7 @@ def read_ply(path: str | os.PathLike[str], sh_degree: int | None = None) -> Gaus
     The layout is that of Kerbl et al. 2023 ("3D Gaussian Splatting for Real-Time Radiance Field Rendering"). Properties
     may be in any order, in either byte order, with or without normals, and with spherical harmonics of degree 0 to 3.
     Normals that are all zero, as most tools write them, are ignored. An opacity of exactly 0 or 1, stored as an
-    infinite logit, becomes a logit of -16 or 16; the preview says how many there are. Without ``scale_2``, as 2DGS
-    writes it, Gaussians are flat.
+    infinite logit, becomes a logit of -16 or 16. Without ``scale_2``, as 2DGS writes it, Gaussians are flat.
 
     Args:
         sh_degree: Largest degree of spherical harmonics that is kept; None for all.

@@ -45,14 +45,77 @@ def write_usd(
     """
     check_positive("fps", fps)
     check_positive("metres_per_unit", metres_per_unit)
-    film, origin = None, NO_ORIGIN
+    last, origin, frame = dict[str, tuple[int, np.ndarray]](), NO_ORIGIN, start - 1
+    stage: Any = None
     for frame, cloud in enumerate(clouds, start):
-        if film is None:
-            film, origin = UsdFilm(fps, metres_per_unit, rotation, cloud.origin), cloud.origin
-        film.add(frame, usd_arrays(cloud.rebased(origin)))
-    if film is None:
+        if stage is None:
+            origin = cloud.origin
+            stage, prim, attributes = _stage(cloud.sh_degree, fps, metres_per_unit, rotation, origin)
+            stage.SetStartTimeCode(frame)
+        arrays = usd_arrays(cloud.rebased(origin))
+        if last and len(arrays["positions"]) != len(last["positions"][1]):
+            raise ValueError(f"Frame {frame} has another number of Gaussians than frame {start}.")
+        for name, array in arrays.items():
+            written, before = last.get(name, (frame, None))
+            if before is not None and np.array_equal(array, before):
+                continue
+            samples = (
+                [(before, frame - 1)] if before is not None and written < frame - 1 else []
+            )  # constant up to there
+            for value, time in [*samples, (array, frame)]:
+                for attribute in attributes[name]:
+                    attribute.Set(_values(name, value), time)
+            last[name] = (frame, array)
+        prim.GetExtentAttr().Set(_values("extent", np.stack(_extent(arrays))), frame)
+    if stage is None:
         raise ValueError(f"{path} was not written because there are no frames; give at least one cloud.")
-    film.save(path)
+    stage.SetEndTimeCode(frame)
+    with atomic(Path(path)) as temporary:
+        stage.GetRootLayer().Export(str(temporary))
+
+
+def _stage(
+    degree: int, fps: float, metres_per_unit: float, rotation: Tensor | None, origin: Origin
+) -> tuple[Any, Any, dict[str, list[Any]]]:
+    """A stage, its splat, and the attributes that each of :func:`usd_arrays` sets."""
+    usd, geom, splat = _pxr("Usd"), _pxr("UsdGeom"), getattr(_pxr("UsdVol"), "ParticleField3DGaussianSplat", None)
+    if splat is None:
+        raise ImportError("usd-core before 26.3 has no splats: run pip install -U usd-core.", name="pxr")
+    stage = usd.Stage.CreateInMemory()
+    geom.SetStageUpAxis(stage, geom.Tokens.z)
+    geom.SetStageMetersPerUnit(stage, metres_per_unit)
+    stage.SetTimeCodesPerSecond(fps)
+    stage.SetFramesPerSecond(fps)
+    world = geom.Xform.Define(stage, "/World")
+    stage.SetDefaultPrim(world.GetPrim())
+    if rotation is not None or any(origin):
+        Gf = _pxr("Gf")
+        turn = torch.eye(3, dtype=torch.float64) if rotation is None else rotation.double()
+        matrix = Gf.Matrix4d(1.0)
+        matrix.SetRotateOnly(Gf.Matrix3d(*turn.T.flatten().tolist()))  # USD multiplies rows
+        matrix.SetTranslateOnly(Gf.Vec3d(*(turn @ torch.tensor(origin, dtype=torch.float64)).tolist()))
+        world.AddTransformOp().Set(matrix)
+    made = splat.Define(stage, _PRIM)
+    prim, kind = made.GetPrim(), _pxr("Sdf").ValueTypeNames.Normal3fArray
+    prim.GetAttribute("radiance:sphericalHarmonicsDegree").Set(degree)
+    shown = made.CreateDisplayColorPrimvar(), made.CreateDisplayOpacityPrimvar()
+    for primvar in shown:
+        primvar.SetInterpolation(geom.Tokens.vertex)
+    attributes = {name: [prim.GetAttribute(name)] for name in ("positions", "orientations", "scales", "opacities")}
+    attributes["opacities"].append(shown[1].GetAttr())
+    attributes["harmonics"] = [prim.GetAttribute("radiance:sphericalHarmonicsCoefficients")]
+    attributes["normals"] = [geom.PrimvarsAPI(prim).CreatePrimvar("normals", kind, geom.Tokens.vertex).GetAttr()]
+    return stage, made, attributes | {"colors": [shown[0].GetAttr()]}
+
+
+def _values(name: str, array: np.ndarray) -> Any:
+    """An array as USD has it: quaternions, numbers or vectors."""
+    Vt = _pxr("Vt")
+    if name == "orientations":
+        return Vt.QuatfArray.FromNumpy(array[:, [1, 2, 3, 0]])
+    if name == "opacities":
+        return Vt.FloatArray.FromNumpy(array)
+    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(array.reshape(-1, 3), dtype=np.float32))
 
 
 def usd_arrays(cloud: GaussianCloud) -> dict[str, np.ndarray]:
@@ -84,99 +147,6 @@ def usd_arrays(cloud: GaussianCloud) -> dict[str, np.ndarray]:
     return {name: np.ascontiguousarray(value.detach().numpy()) for name, value in arrays.items()}
 
 
-class UsdFilm:
-    """A USD stage to which frames are added one by one.
-
-    The whole film is in memory until it is saved, about 60 bytes for each Gaussian and frame without view-dependent
-    colours.
-
-    Args:
-        fps: Frames per second.
-        metres_per_unit: Length of a scene unit [m].
-        rotation: Rotation from scene directions to z up, shape (3, 3); the scene's z is up if None.
-        origin: Point that the centres count from, see :class:`~gaussian_swaying.gaussians.cloud.GaussianCloud`.
-
-    Raises:
-        ImportError: If usd-core is not installed, or has no splats yet.
-    """
-
-    def __init__(
-        self, fps: float, metres_per_unit: float = 1.0, rotation: Tensor | None = None, origin: Origin = NO_ORIGIN
-    ) -> None:
-        usd, geom = _pxr("Usd"), _pxr("UsdGeom")
-        splat = getattr(_pxr("UsdVol"), "ParticleField3DGaussianSplat", None)
-        if splat is None:
-            raise ImportError("usd-core before 26.3 has no splats: run pip install -U usd-core.", name="pxr")
-        self._stage = usd.Stage.CreateInMemory()
-        geom.SetStageUpAxis(self._stage, geom.Tokens.z)
-        geom.SetStageMetersPerUnit(self._stage, metres_per_unit)
-        self._stage.SetTimeCodesPerSecond(fps)
-        self._stage.SetFramesPerSecond(fps)
-        world = geom.Xform.Define(self._stage, "/World")
-        self._stage.SetDefaultPrim(world.GetPrim())
-        if rotation is not None or any(origin):
-            Gf = _pxr("Gf")
-            turn = torch.eye(3, dtype=torch.float64) if rotation is None else rotation.double()
-            matrix = Gf.Matrix4d(1.0)
-            matrix.SetRotateOnly(Gf.Matrix3d(*turn.T.flatten().tolist()))  # USD multiplies rows
-            matrix.SetTranslateOnly(Gf.Vec3d(*(turn @ torch.tensor(origin, dtype=torch.float64)).tolist()))
-            world.AddTransformOp().Set(matrix)
-        self._prim = splat.Define(self._stage, _PRIM)
-        self._last: dict[str, tuple[int, np.ndarray]] = {}
-        self._first: int | None = None
-        self._end = 0
-
-    def add(self, frame: int, arrays: dict[str, np.ndarray]) -> None:
-        """Add a frame as arrays from :func:`usd_arrays`; add frames in order."""
-        if self._first is None:
-            self._first = self._end = frame
-            self._stage.SetStartTimeCode(frame)
-            self._create(arrays)
-        elif len(arrays["positions"]) != len(self._last["positions"][1]):
-            raise ValueError(f"Frame {frame} has another number of Gaussians than frame {self._first}.")
-        for name, array in arrays.items():
-            written, last = self._last.get(name, (frame, None))
-            if last is not None and np.array_equal(array, last):
-                continue
-            if last is not None and written < self._end:  # it was constant up to the previous frame
-                self._set(name, last, self._end)
-            self._set(name, array, frame)
-            self._last[name] = (frame, array)
-        low, high = _extent(arrays)
-        self._prim.GetExtentAttr().Set(_vec3(np.stack([low, high])), frame)
-        self._stage.SetEndTimeCode(frame)
-        self._end = frame
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        with atomic(Path(path)) as temporary:
-            self._stage.GetRootLayer().Export(str(temporary))
-
-    def _create(self, arrays: dict[str, np.ndarray]) -> None:
-        geom, prim = _pxr("UsdGeom"), self._prim.GetPrim()
-        prim.GetAttribute("radiance:sphericalHarmonicsDegree").Set(round(arrays["harmonics"].shape[1] ** 0.5) - 1)
-        kind = _pxr("Sdf").ValueTypeNames.Normal3fArray
-        self._normals = geom.PrimvarsAPI(prim).CreatePrimvar("normals", kind, geom.Tokens.vertex).GetAttr()
-        for primvar in (self._prim.CreateDisplayColorPrimvar(), self._prim.CreateDisplayOpacityPrimvar()):
-            primvar.SetInterpolation(geom.Tokens.vertex)
-
-    def _set(self, name: str, array: np.ndarray, frame: int) -> None:
-        Vt, prim = _pxr("Vt"), self._prim.GetPrim()
-        if name == "orientations":
-            prim.GetAttribute(name).Set(Vt.QuatfArray.FromNumpy(array[:, [1, 2, 3, 0]]), frame)
-        elif name == "opacities":
-            values = Vt.FloatArray.FromNumpy(array)
-            prim.GetAttribute(name).Set(values, frame)
-            self._prim.GetDisplayOpacityAttr().Set(values, frame)
-        elif name == "harmonics":
-            prim.GetAttribute("radiance:sphericalHarmonicsCoefficients").Set(_vec3(array.reshape(-1, 3)), frame)
-        elif name == "colors":
-            self._prim.GetDisplayColorAttr().Set(_vec3(array), frame)
-        elif name == "normals":
-            self._normals.Set(_vec3(array), frame)
-        else:
-            prim.GetAttribute(name).Set(_vec3(array), frame)
-
-
 def _pxr(name: str) -> Any:
     try:
         return import_module(f"pxr.{name}")
@@ -184,10 +154,6 @@ def _pxr(name: str) -> Any:
         raise ImportError(
             "USD files need usd-core: run pip install 'gaussian-swaying[usd]', or choose another format.", name="pxr"
         ) from error
-
-
-def _vec3(array: np.ndarray) -> Any:
-    return _pxr("Vt").Vec3fArray.FromNumpy(np.ascontiguousarray(array, dtype=np.float32))
 
 
 def _extent(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

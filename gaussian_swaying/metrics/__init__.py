@@ -1,1 +1,1 @@
-"""Distances between a run and a reference: structural similarity, Chamfer and Fréchet video distance."""
+"""Distances between a run and a reference: structural similarity and nearest points."""

@@ -10,7 +10,6 @@ from torch.nn import functional
 
 SSIM_TAPS = 11
 """Width of the window of :func:`ssim_map` [pixels]."""
-PADDINGS = ("valid", "reflect", "zeros")
 _SIGMA = 1.5
 _C1, _C2 = 0.01**2, 0.03**2
 
@@ -25,8 +24,7 @@ def ssim_map(image: Tensor, target: Tensor, padding: str = "valid") -> Tensor:
         image: Picture, shape (..., H, W, C).
         target: Picture to compare it with, of the same shape.
         padding: ``valid`` uses only windows inside the picture, like fused-ssim's option with that name. ``reflect``
-            mirrors both pictures at their edges, and its mean is the SSIM of torchmetrics 1.9. ``zeros`` pads them with
-            zeros, as Kerbl et al. 2023 do.
+            mirrors both pictures at their edges, and its mean is the SSIM of torchmetrics 1.9.
 
     Returns:
         Similarity up to 1, shape (..., H - 10, W - 10, C) with ``valid``, else that of the pictures.
@@ -39,8 +37,7 @@ def ssim_map(image: Tensor, target: Tensor, padding: str = "valid") -> Tensor:
     planes = x.shape[1]
     window = _window(x.dtype, x.device)
     if padding != "valid":
-        mode = "constant" if padding == "zeros" else padding
-        x, y = (functional.pad(plane, [SSIM_TAPS // 2] * 4, mode) for plane in (x, y))
+        x, y = (functional.pad(plane, [SSIM_TAPS // 2] * 4, padding) for plane in (x, y))
     moments = torch.cat([x, y, x * x, y * y, x * y], dim=1)
     # planes as groups, not as a batch: the gradient of a convolution of one channel is slow
     groups = moments.shape[1]

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from gaussian_swaying._checks import check_shape
 from gaussian_swaying.geometry.patches import smallest_axis_normal
@@ -86,27 +85,3 @@ def surface_maps(channels: Tensor, alpha: Tensor, camera: Camera, least_alpha: f
     unit = torch.where(known, normal / safe, 0.0)
     distance = torch.where(known, channels[..., 3:] / safe, 0.0)
     return SurfaceMaps(normal, unit, distance, depth, known)
-
-
-def depth_normals(depth: Tensor, known: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Normals of the surface that the depths of neighbouring pixels span, by central differences.
-
-    Args:
-        depth: Depth along the optical axis [scene units], shape (H, W, 1).
-        known: Whether a pixel shows a surface, bool (H, W, 1).
-
-    Returns:
-        Unit normals towards the camera, shape (H, W, 3), and where they are defined, bool (H, W, 1): not at the border
-        of the picture, and not beside pixels without a surface.
-    """
-    check_shape("depth", depth, camera.height, camera.width, 1)
-    check_shape("known", known, camera.height, camera.width, 1)
-    point = pixel_rays(camera) * depth
-    across, down = point[1:-1, 2:] - point[1:-1, :-2], point[2:, 1:-1] - point[:-2, 1:-1]
-    inner = known[1:-1, 2:] & known[1:-1, :-2] & known[2:, 1:-1] & known[:-2, 1:-1] & known[1:-1, 1:-1]
-    turned = torch.linalg.cross(down, across)  # x to the right, y down: this order points at the camera
-    length = turned.norm(dim=-1, keepdim=True)
-    inner = inner & (length > 0)
-    unit = torch.where(inner, turned / torch.where(inner, length, 1.0), 0.0)
-    border = (0, 0, 1, 1, 1, 1)
-    return functional.pad(unit, border), functional.pad(inner, border)

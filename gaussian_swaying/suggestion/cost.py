@@ -12,8 +12,6 @@ import torch
 from gaussian_swaying._files import PNG
 from gaussian_swaying._provenance import cores, describe_device
 from gaussian_swaying.gaussians.cloud import GaussianCloud
-from gaussian_swaying.gaussians.harmonics import SH_DC
-from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.kernels.cpu import compiled
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.recording.writer import WORKERS
@@ -22,7 +20,6 @@ from gaussian_swaying.simulation.simulation import Simulation
 
 BUDGET = 2.5  # s; for the frames that are timed
 MOST_FRAMES = 9  # timed at most
-TRIAL = 0.02  # s; substeps are timed together until they take so long
 WARM_UP = 3.0  # s; kernels of a run are loaded and recorded in 2 to 3 s; compiling is done only once on a machine
 
 
@@ -113,66 +110,37 @@ def estimate_cost(
         substeps=substeps,
         substep_seconds=seconds,
         simulation_seconds=seconds * substeps * (frames - 1),
-        picture_seconds=_picture_seconds(simulation, state, seconds * substeps, cloud) if drawn else None,
+        picture_seconds=_picture_seconds(simulation, state, cloud) if drawn else None,
         startup_seconds=startup_seconds + warm_up,
     )
 
 
 def _substep_seconds(simulation: Simulation, state: State, at_rest: int) -> float:
-    """Time for a substep [s], without compiling.
-
-    A rollout of one substep would measure what a rollout takes besides: there are as many as take some time, but no
-    more than in a frame.
-    """
-    steps = 1
+    """Time for a substep [s], without compiling: of eight, the quicker of two trials."""
+    steps, dt = min(8, at_rest), simulation.frame_dt / at_rest
 
     def rollout() -> None:
-        dt = simulation.frame_dt / at_rest
         simulation.solver.watched_rollout(state, dt, steps, simulation.forces, looks=1)
 
-    while True:
-        seconds = min(_seconds(simulation, rollout) for _ in range(2)) / steps
-        if steps == at_rest or seconds * steps > TRIAL:
-            return seconds
-        steps = min(8 * steps, at_rest)
+    return min(_seconds(simulation, rollout) for _ in range(2)) / steps
 
 
-def _picture_seconds(simulation: Simulation, state: State, frame: float, cloud: GaussianCloud | None) -> float:
-    """Time that the pictures of a frame add to the ``frame`` seconds without [s].
-
-    Further threads and ffmpeg write the files and the video. If there are more than two cores, they use the others, and
-    the run waits only for what they cannot write in the time of a frame. Every tenth and every fifth one of all
-    Gaussians tell how the time grows with their number.
-    """
+def _picture_seconds(simulation: Simulation, state: State, cloud: GaussianCloud | None) -> float:
+    """Time that the pictures of a frame add [s]: to draw them, in proportion to all Gaussians, and to write them."""
     import imageio.v3 as iio
 
-    painter, free = simulation.painter, cores()
+    painter = simulation.painter
     count = (1 + len(painter.cameras)) * len(simulation.recorder.renders)  # as if all were the first
     pixels = (painter.render(state, 0).color.clamp(0, 1) * 255).byte().cpu().numpy()
+    more = 1.0 if cloud is None else len(cloud) / len(painter.scene.model.means)
 
     def encode() -> None:  # work similar to writing a picture and its part of the video
         for _ in range(2):
             iio.imwrite("<bytes>", pixels, extension=".png", **PNG)
 
-    draw = count * min(_seconds(simulation, lambda: painter.render(state, 0)) for _ in range(2))
-    if cloud is not None:
-        tenth, fifth = (_drawn(simulation, cloud.select(torch.arange(0, len(cloud), k))) for k in (10, 5))
-        each = max(fifth - tenth, 0.0) / (0.1 * len(cloud))
-        draw += count * each * (len(cloud) - len(painter.scene.model.means))
-    write = count * min(_seconds(simulation, encode) for _ in range(2))
-    return draw + write if free <= 2 else max(draw, write / min(WORKERS, free - 1) - frame)
-
-
-def _drawn(simulation: Simulation, cloud: GaussianCloud) -> float:
-    """Time to draw Gaussians from the camera of a run [s]."""
-    painter, some = simulation.painter, cloud.to(simulation.device)
-    camera, colours = painter.camera_at(0), 0.5 + SH_DC * some.sh[:, 0]
-    shape, opacity = covariance(some.quats, some.scales), some.opacities.sigmoid()
-
-    def draw() -> None:
-        painter.renderer(some.means, shape, opacity, colours, camera, painter.background)
-
-    return min(_seconds(simulation, draw) for _ in range(2))
+    draw = more * min(_seconds(simulation, lambda: painter.render(state, 0)) for _ in range(2))
+    write = min(_seconds(simulation, encode) for _ in range(2))
+    return count * (draw + write / min(WORKERS, max(1, cores() - 1)))  # further threads write
 
 
 def _seconds(simulation: Simulation, work: Callable[[], object]) -> float:

@@ -66,23 +66,25 @@ def write_shards(
     named = [axis if size == 1 else f"{axis}.{place}" for axis, size in axes.items() for place in range(size)]
 
     def sample(name: str) -> dict[str, Any]:
-        place = folder / RUNS / name
+        place, pictures = folder / RUNS / name, _pictures(folder, name)
+        trajectory, motion = place / "trajectory.npz", place / "nodes.npz"
+        for wanted, asked, there, setting in (
+            ("frames", frames, bool(pictures), "recorder.renders with color"),
+            ("positions", positions, trajectory.exists(), "recorder.trajectory: true"),
+            ("nodes", nodes, motion.exists(), "recorder.nodes: true and solver.formulation: total"),
+        ):
+            if asked and not there:
+                raise ValueError(f"{place} has no {wanted}: leave out `{wanted}`, or sweep with {setting}.")
         told = {"run": name, "settings": runs[name], "parameter_names": named, "summary": done[name]}
         values = np.array([number for axis in axes for number in flat[name][axis]])
         found: dict[str, Any] = {"__key__": name, "json": told, "parameters.npy": values}
         if frames:
-            pictures = _pictures(folder, name)
-            _check_recorded(bool(pictures), place, "frames", "recorder.renders with color")
             found |= {picture.name: picture.read_bytes() for picture in pictures}
         if positions:
-            path = place / "trajectory.npz"
-            _check_recorded(path.exists(), place, "positions", "recorder.trajectory: true")
-            states = (load_trajectory(path, frame)[0].numpy() for frame in range(int(done[name]["frames"])))
+            states = (load_trajectory(trajectory, frame)[0].numpy() for frame in range(int(done[name]["frames"])))
             found["positions.npy"] = np.stack(list(states))
         if nodes:
-            path = place / "nodes.npz"
-            _check_recorded(path.exists(), place, "nodes", "recorder.nodes: true and solver.formulation: total")
-            found["nodes.npy"] = load_nodes(path).numpy()
+            found["nodes.npy"] = load_nodes(motion).numpy()
         return found
 
     target = folder / SHARDS if output is None else Path(output)
@@ -110,83 +112,39 @@ def _pictures(folder: Path, run: str) -> list[Path]:
     return sorted((folder / RUNS / run / "frames").glob("[0-9]*.png"))
 
 
-def _check_recorded(there: bool, run: Path, wanted: str, setting: str) -> None:
-    if not there:
-        raise ValueError(f"{run} has no {wanted}: leave out `{wanted}`, or sweep with {setting}.")
-
-
-PICTURES = ("last", "middle")
 PER_SHEET = 200  # runs
 WIDTH, BAND, GAP = 240, 34, 4  # pixels of a picture, of the text below it, and between two
-BACKGROUND, EMPTY, TEXT = (24, 24, 24), (48, 48, 48), (235, 235, 235)
 
 
-def write_contact_sheets(folder: Path, picture: str = "last") -> list[Path]:
-    """Write ``contact_sheet.png`` of a sweep, and ``contact_sheet_2.png`` ... if there are more than 200 runs.
-
-    Args:
-        picture: Frame to show, ``last`` or ``middle``.
-    """
-    runs = read_record(folder)["runs"]
-    files = []
+def write_contact_sheets(folder: Path) -> None:
+    """Write the last frame of every run: ``contact_sheet.png``, ``contact_sheet_2.png`` and so on for 200 runs each."""
+    runs = {f"{number:05d}": run for number, run in enumerate(read_record(folder)["runs"])}
     for first in range(0, len(runs), PER_SHEET):
-        part = {f"{first + number:05d}": run for number, run in enumerate(runs[first : first + PER_SHEET])}
-        files.append(folder / ("contact_sheet.png" if first == 0 else f"contact_sheet_{first // PER_SHEET + 1}.png"))
-        sheet = _sheet(folder, part, picture)
-        with atomic(files[-1]) as temporary:
-            sheet.save(temporary)
-    return files
+        number = f"_{first // PER_SHEET + 1}" if first else ""
+        with atomic(folder / f"contact_sheet{number}.png") as temporary:
+            _sheet(folder, dict([*runs.items()][first : first + PER_SHEET])).save(temporary)
 
 
-def _sheet(folder: Path, runs: Mapping[str, Mapping[str, Any]], picture: str) -> Image:
-    from PIL import Image, ImageDraw, ImageFont
+def _sheet(folder: Path, runs: Mapping[str, Mapping[str, Any]]) -> Image:
+    from PIL import Image, ImageDraw, ImageFont, ImageOps
 
-    shown = {name: _frame(folder, name, picture) for name in runs}
-    sizes = [image.size for image in shown.values() if image is not None]
-    height = max((height for _, height in sizes), default=WIDTH * 9 // 16)
+    results, shown = {name: read_result(folder, name) or {"status": "missing"} for name in runs}, {}
+    for name, result in results.items():
+        pictures = _pictures(folder, name) if result["status"] == "complete" else []
+        if pictures:
+            with Image.open(pictures[-1]) as picture:
+                shown[name] = ImageOps.contain(picture.convert("RGB"), (WIDTH, 4 * WIDTH))
+    height = max((picture.height for picture in shown.values()), default=WIDTH * 9 // 16)
     across = max(1, min(len(runs), round(math.sqrt(len(runs) * height / WIDTH * 1.6))))
-    down = math.ceil(len(runs) / across)
-    sheet = Image.new("RGB", (across * (WIDTH + GAP) + GAP, down * (height + BAND + GAP) + GAP), BACKGROUND)
+    size = across * (WIDTH + GAP) + GAP, -(-len(runs) // across) * (height + BAND + GAP) + GAP
+    sheet = Image.new("RGB", size, (24, 24, 24))
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(12)
     for number, (name, run) in enumerate(runs.items()):
         left, top = GAP + number % across * (WIDTH + GAP), GAP + number // across * (height + BAND + GAP)
-        image = shown[name]
-        if image is None:
-            result = read_result(folder, name) or {"status": "missing"}
-            draw.rectangle((left, top, left + WIDTH - 1, top + height - 1), fill=EMPTY)
-            what = "no picture" if result["status"] == "complete" else result["status"]
-            draw.text((left + WIDTH / 2, top + height / 2), what, TEXT, font, anchor="mm")
+        if name in shown:
+            sheet.paste(shown[name], (left, top))
         else:
-            sheet.paste(image, (left, top))
-        lines = [name, ", ".join(f"{axis.rpartition('.')[2]} {_short(value)}" for axis, value in run.items())]
-        for line, text in enumerate(lines):
-            draw.text((left + 3, top + height + 2 + 15 * line), _fitted(text, draw, font), TEXT, font)
+            draw.text((left + WIDTH / 2, top + height / 2), results[name]["status"], font=font, anchor="mm")
+        values = ", ".join(f"{axis.rpartition('.')[2]} {json.dumps(value)}" for axis, value in run.items())
+        draw.text((left + 3, top + height + 2), f"{name}\n{values[:40]}", font=font)
     return sheet
-
-
-def _frame(folder: Path, name: str, picture: str) -> Image | None:
-    from PIL import Image
-
-    result = read_result(folder, name)
-    if result is None or result["status"] != "complete":
-        return None
-    files = _pictures(folder, name)
-    if not files:
-        return None
-    with Image.open(files[-1] if picture == "last" else files[len(files) // 2]) as image:
-        height = max(1, round(image.height * WIDTH / image.width))
-        return image.convert("RGB").resize((WIDTH, height), Image.Resampling.BOX if image.width > WIDTH else 0)
-
-
-def _short(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if isinstance(value, list):
-        return "[" + ", ".join(_short(item) for item in value) + "]"
-    return value if isinstance(value, str) else json.dumps(value)
-
-
-def _fitted(text: str, draw: Any, font: Any) -> str:
-    while text and draw.textlength(text, font) > WIDTH - 6:
-        text = text[:-2].rstrip("…") + "…" if len(text) > 2 else ""
-    return text

@@ -29,19 +29,8 @@ FIELDS = ("base", "settings", "axes", "draws", "seed")
 NOT_HERE = ("config", "output", "resume", "device", "preset")
 
 
-@dataclass(frozen=True)
-class Axis:
-    """One option of ``sim`` that differs between the runs.
-
-    Args:
-        name: The option as on the command line, without the dashes: ``wind.flow``.
-        values: Its values, which are combined with those of the other axes; empty for a random draw.
-        draw: For a random draw, a value from a random stream; None otherwise.
-    """
-
-    name: str
-    values: tuple[Any, ...] = ()
-    draw: Callable[[random.Random], Any] | None = None
+Axis = list[Any] | Callable[[random.Random], Any]
+"""The values of an option, which are combined with those of other axes; or a value from a random stream."""
 
 
 def read_axis(name: str, given: Any) -> Axis:
@@ -53,23 +42,68 @@ def read_axis(name: str, given: Any) -> Axis:
             or ``integer`` (both ends included), or ``{draw: choice, of: [...]}``.
 
     Example:
-        >>> read_axis("material.E", {"from": 100, "to": 10000, "count": 3, "scale": "log"}).values
-        (100.0, 1000.0, 10000.0)
+        >>> read_axis("material.E", {"from": 100, "to": 10000, "count": 3, "scale": "log"})
+        [100.0, 1000.0, 10000.0]
     """
     where = f"axes.{name}"
-    if isinstance(given, list):
-        if not given:
-            raise ValueError(f"Expected `{where}` to have values, but it is empty: give some, or remove the axis.")
-        return Axis(name, tuple(given))
+    if isinstance(given, list) and given:
+        return given
     if not isinstance(given, Mapping):
         raise ValueError(
-            f"Expected `{where}` to be a list of values, a range such as {{from: 1, to: 9, count: 5}}, or a draw such "
-            f"as {{draw: uniform, low: 1, high: 9}}, but got {given!r}: for one value write [{given}]."
+            f"Expected `{where}` to be a list of values, not empty, a range such as {{from: 1, to: 9, count: 5}}, or a "
+            f"draw such as {{draw: uniform, low: 1, high: 9}}, but got {given!r}: for one value write [{given}]."
         )
-    return Axis(name, draw=_draw(where, given)) if "draw" in given else Axis(name, _range(where, given))
+    drawn, fields = "draw" in given, tuple[str, ...](("from", "to", "count", "scale"))
+    kind = given.get("draw", given.get("scale", "linear"))
+    if drawn:
+        check_choice(f"{where}.draw", kind, ("uniform", "log", "integer", "choice"))
+        fields = ("draw", "of") if kind == "choice" else ("draw", "low", "high")
+    else:
+        check_choice(f"{where}.scale", kind, ("linear", "log"))
+    for entry in given:
+        if entry not in fields:
+            raise ValueError(f"`{where}` has an unknown entry `{entry}`: use {', '.join(fields)}.")
+    if kind == "choice":
+        choices = given.get("of")
+        if not isinstance(choices, list) or not choices:
+            raise ValueError(f"Expected `{where}.of` to be a list of values to choose from, but got {choices!r}.")
+        return lambda stream: choices[stream.randrange(len(choices))]
+    ends = ("low", "high") if drawn else ("from", "to")
+    low, high = (_finite(f"{where}.{end}", given.get(end)) for end in ends)
+    if kind == "log" and min(low, high) <= 0:
+        raise ValueError(
+            f"Expected `{where}.{ends[0]}` and `{ends[1]}` to be positive on a logarithmic scale, but got {low} and "
+            f"{high}: use {'draw: uniform' if drawn else 'scale: linear'}."
+        )
+
+    def between(part: float) -> float:
+        """To 12 digits, as C libraries differ in powers."""
+        return float(f"{low * (high / low) ** part if kind == 'log' else low + (high - low) * part:.12g}")
+
+    if not drawn:
+        check_whole(f"{where}.count", given.get("count"), 2, MOST_RUNS)
+        last = given["count"] - 1
+        return [low, *(between(index / last) for index in range(1, last)), high]
+    if low > high:
+        raise ValueError(f"Expected `{where}.low` to be at most `high`, but got {low} and {high}: exchange them.")
+    if kind == "integer":
+        for end in ends:
+            check_whole(f"{where}.{end}", given[end], -(1 << 63))
+        return lambda stream: stream.randint(given["low"], given["high"])
+    return lambda stream: between(stream.random())
 
 
-def runs_of(axes: list[Axis], draws: int = 1, seed: int = 0) -> list[dict[str, Any]]:
+def _finite(where: str, value: Any) -> float:
+    try:
+        number = math.nan if isinstance(value, bool) else float(value)
+    except (ValueError, TypeError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError(f"Expected `{where}` to be a finite number, but got {value!r}: set it.")
+    return number
+
+
+def runs_of(axes: Mapping[str, Axis], draws: int = 1, seed: int = 0) -> list[dict[str, Any]]:
     """The settings of every run: all combinations of lists and ranges, the first axis slowest, each drawn some times.
 
     A drawn value is a function of seed, axis and number of the run, so that it stays when other axes change.
@@ -78,91 +112,23 @@ def runs_of(axes: list[Axis], draws: int = 1, seed: int = 0) -> list[dict[str, A
         For each run the value of every axis, in the order of the axes.
 
     Example:
-        >>> runs_of([Axis("a", (1, 2)), Axis("b", (3, 4))])
+        >>> runs_of({"a": [1, 2], "b": [3, 4]})
         [{'a': 1, 'b': 3}, {'a': 1, 'b': 4}, {'a': 2, 'b': 3}, {'a': 2, 'b': 4}]
     """
-    lists = [axis for axis in axes if axis.draw is None]
+    lists = [axis for axis in axes.values() if isinstance(axis, list)]
     if draws > 1 and len(lists) == len(axes):
         raise ValueError(f"Expected an axis with a `draw`, as `draws` is {draws}: add one, or set `draws` to 1.")
-    count = math.prod(len(axis.values) for axis in lists) * draws
+    count = math.prod(map(len, lists)) * draws
     if count > MOST_RUNS:
         raise ValueError(f"The axes make {count:,} runs, more than the limit of {MOST_RUNS:,}: give fewer values.")
     runs = []
-    for number, (*values, _) in enumerate(itertools.product(*(axis.values for axis in lists), range(draws))):
-        listed = iter(values)
-        runs.append(
-            {
-                axis.name: axis.draw(random.Random(f"{seed}/{axis.name}/{number}")) if axis.draw else next(listed)
-                for axis in axes
-            }
-        )
+    for number, (*values, _) in enumerate(itertools.product(*lists, range(draws))):
+        listed, run = iter(values), {}
+        for name, axis in axes.items():
+            drawn = None if isinstance(axis, list) else axis(random.Random(f"{seed}/{name}/{number}"))
+            run[name] = next(listed) if isinstance(axis, list) else drawn
+        runs.append(run)
     return runs
-
-
-def _range(where: str, given: Mapping[str, Any]) -> tuple[float, ...]:
-    _only(where, given, "from", "to", "count", "scale")
-    count, scale = given.get("count"), given.get("scale", "linear")
-    if isinstance(count, bool) or not isinstance(count, int) or not 1 < count <= MOST_RUNS:
-        raise ValueError(
-            f"Expected `{where}.count` to be a whole number from 2 to {MOST_RUNS:,}, but got {count!r}: for one value "
-            "use a list."
-        )
-    check_choice(f"{where}.scale", scale, ("linear", "log"))
-    low, high, between = _between(where, given, "from", "to", scale, "scale: linear")
-    return (low, *(between(index / (count - 1)) for index in range(1, count - 1)), high)
-
-
-def _draw(where: str, given: Mapping[str, Any]) -> Callable[[random.Random], Any]:
-    kind = given["draw"]
-    check_choice(f"{where}.draw", kind, ("uniform", "log", "integer", "choice"))
-    if kind == "choice":
-        _only(where, given, "draw", "of")
-        choices = given.get("of")
-        if not isinstance(choices, list) or not choices:
-            raise ValueError(f"Expected `{where}.of` to be a list of values to choose from, but got {choices!r}.")
-        return lambda stream: choices[stream.randrange(len(choices))]
-    _only(where, given, "draw", "low", "high")
-    low, high, between = _between(where, given, "low", "high", kind, "draw: uniform")
-    if low > high:
-        raise ValueError(f"Expected `{where}.low` to be at most `high`, but got {low} and {high}: exchange them.")
-    if kind == "integer":
-        for name in ("low", "high"):
-            check_whole(f"{where}.{name}", given[name], -(1 << 63))
-        return lambda stream: stream.randint(given["low"], given["high"])
-    return lambda stream: between(stream.random())
-
-
-def _between(
-    where: str, given: Mapping[str, Any], first: str, last: str, scale: str, remedy: str
-) -> tuple[float, float, Callable[[float], float]]:
-    """Both ends, and the value at a share of the way between them, to 12 digits: C libraries differ in powers."""
-    ends = []
-    for name in (first, last):
-        value = given.get(name)
-        try:
-            number = math.nan if isinstance(value, bool) else float(value)  # type: ignore[arg-type]
-        except (ValueError, TypeError, OverflowError):
-            number = math.nan
-        if not math.isfinite(number):
-            raise ValueError(f"Expected `{where}.{name}` to be a finite number, but got {value!r}: set it.")
-        ends.append(number)
-    low, high = ends
-    if scale == "log" and min(ends) <= 0:
-        raise ValueError(
-            f"Expected `{where}.{first}` and `{last}` to be positive on a logarithmic scale, but got {low} and "
-            f"{high}: use {remedy}."
-        )
-
-    def between(part: float) -> float:
-        return float(f"{low * (high / low) ** part if scale == 'log' else low + (high - low) * part:.12g}")
-
-    return low, high, between
-
-
-def _only(where: str, given: Mapping[str, Any], *known: str) -> None:
-    for name in given:
-        if name not in known:
-            raise ValueError(f"`{where}` has an unknown entry `{name}`: use {', '.join(known)}.")
 
 
 @dataclass(frozen=True)
@@ -229,7 +195,7 @@ def read_sweep(path: str | os.PathLike[str], find: Callable[[str], str] = str) -
     draws, seed = given.get("draws", 1), given.get("seed", 0)
     check_whole("draws", draws, 1)
     check_whole("seed", seed, -(1 << 63))
-    runs = runs_of([read_axis(name, entry) for name, entry in axes.items()], draws, seed)
+    runs = runs_of({name: read_axis(name, entry) for name, entry in axes.items()}, draws, seed)
     return Sweep([find(name) for name in base], runs, settings)
 
 

@@ -23,20 +23,9 @@ SWEEP, TABLE, PARQUET = "sweep.json", "sweep.csv", "sweep.parquet"
 RUNS, RESULTS, LOGS = "runs", "results", "logs"
 OURS = (SWEEP, TABLE, PARQUET, RUNS, RESULTS, LOGS)
 FIGURES = (
-    "frames",
-    "substeps",
-    "simulated_s",
-    "particles",
-    "gaussians",
-    "mass_kg",
-    "patch_area_m2",
-    "displacement_mean_max_m",
-    "wind_work_J",
-    "largest_cfl",
-    "stretch_min",
-    "stretch_max",
-    "lost_particles",
-    "torn_particles",
+    *("frames", "substeps", "simulated_s", "particles", "gaussians", "mass_kg", "patch_area_m2"),
+    *("displacement_mean_max_m", "wind_work_J", "largest_cfl", "stretch_min", "stretch_max"),
+    *("lost_particles", "torn_particles"),
 )
 """Entries of ``summary.json`` in the table; none of them is a time of the clock."""
 
@@ -46,28 +35,38 @@ SUMMARY = (*FIGURES, *(f"{name}_end_J" for name in ENERGIES), "warnings")
 
 
 def open_folder(folder: Path, plan: Plan, resume: bool, together: int = 1) -> FolderLock:
-    """Make and lock the folder of a sweep, or lock the one that is continued."""
-    held = (folder / SWEEP).exists()
+    """Make and lock the folder of a sweep, or lock the one that is continued.
+
+    Returns:
+        The lock, to be released at the end.
+    """
+    import yaml
+
+    held, foreign = (folder / SWEEP).exists(), [name for name in OURS if os.path.lexists(folder / name)]
     if resume and not held:
         raise ValueError(f"There is nothing to resume in {folder}: it has no {SWEEP}; leave out --resume.")
-    if held and not resume:
-        raise ValueError(
-            f"{folder} holds a sweep already: add --resume to do what is missing in it, or choose another --output."
+    if foreign and not resume:
+        what = (
+            "holds a sweep already: add --resume to do what is missing in it"
+            if held
+            else f"contains {foreign[0]} of something else"
         )
-    foreign = [name for name in OURS if os.path.lexists(folder / name)]
-    if foreign and not held:
-        raise ValueError(
-            f"The output folder {folder} contains {', '.join(foreign)} of something else: choose another --output."
-        )
-    new = _described(plan) | ({"together": together} if together > 1 else {})
+        raise ValueError(f"The output folder {folder} {what}: choose another --output.")
+    new = {
+        "made_by": "gaussian_swaying",
+        "format": 1,
+        "frames": plan.frames,
+        "runs": [dict(run) for run in plan.runs],
+        "splats": dict(plan.splats),
+        "config": yaml.safe_load(plan.config),
+    }
+    new = dict(json.loads(json.dumps(new | ({"together": together} if together > 1 else {}))))  # as it is read again
     if held:
         _check_same(folder, new)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ValueError(
-            f"The output folder {folder} cannot be written ({error.strerror or error}): choose another with --output."
-        ) from error
+        raise ValueError(f"{folder} cannot be written ({error.strerror}): choose another --output.") from error
     lock = hold_folder(folder, "choose another with --output")
     try:
         remove_temporaries(folder)  # of a sweep that was killed while writing
@@ -89,20 +88,6 @@ def read_record(folder: Path) -> dict[str, Any]:
     if not isinstance(record, dict) or not isinstance(record.get("runs"), list) or not record["runs"]:
         raise ValueError(f"{folder / SWEEP} lists no runs: it is damaged; start the sweep again in another folder.")
     return record
-
-
-def _described(plan: Plan) -> dict[str, Any]:
-    import yaml
-
-    described = {
-        "made_by": "gaussian_swaying",
-        "format": 1,
-        "frames": plan.frames,
-        "runs": [dict(run) for run in plan.runs],
-        "splats": dict(plan.splats),
-        "config": yaml.safe_load(plan.config),
-    }
-    return dict(json.loads(json.dumps(described)))  # as it is read again
 
 
 def _check_same(folder: Path, new: dict[str, Any]) -> None:
@@ -129,12 +114,10 @@ def read_result(folder: Path, name: str) -> dict[str, Any] | None:
         return None
     try:
         result = read_json(path, "result")
-        if isinstance(result, dict) and isinstance(result.get("status"), str):
-            return result
-        why = "it has no status"
-    except ValueError as error:
-        why = str(error).rstrip(".")
-    raise ValueError(f"{path} is damaged ({why}): remove it, and --resume does its run again.")
+        result["status"].lower()
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise ValueError(f"{path} is damaged ({error}): remove it, and --resume does its run again.") from error
+    return dict(result)
 
 
 def result_of(summary: Mapping[str, Any], attempt: int, where: str) -> dict[str, Any]:
@@ -165,20 +148,16 @@ def write_tables(folder: Path, plan: Plan, results: Mapping[str, Any], parquet: 
         import pyarrow
         import pyarrow.parquet
 
-        columns = {name: _column(name, [row[name] for row in rows]) for name in rows[0]}
+        texts = {"status", "reason"}.union(
+            name for row in rows for name, value in row.items() if isinstance(value, dict | str)
+        )
+        for row in rows:
+            row |= {name: _cell(row[name]) for name in texts}
+        columns = {name: [row[name] for row in rows] for name in rows[0]}
+        kinds = {name: pyarrow.string() if name in texts else None for name in columns}
+        table = pyarrow.table({name: pyarrow.array(values, kinds[name]) for name, values in columns.items()})
         with atomic(folder / PARQUET) as temporary:
-            pyarrow.parquet.write_table(pyarrow.table(columns), temporary)
-
-
-def _column(name: str, values: list[Any]) -> Any:
-    import pyarrow
-
-    if name in ("status", "reason") or any(isinstance(value, dict) for value in values):
-        return pyarrow.array([_cell(value) for value in values], pyarrow.string())
-    try:
-        return pyarrow.array(values)
-    except pyarrow.ArrowException:  # numbers and text, say
-        return pyarrow.array([_cell(value) for value in values])
+            pyarrow.parquet.write_table(table, temporary)
 
 
 def _cell(value: Any) -> Any:

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import torch
 from loky import ProcessPoolExecutor
@@ -36,7 +36,7 @@ from gaussian_swaying.runs.signals import stop_signals
 from gaussian_swaying.simulation.measure import SimulationDiverged
 from gaussian_swaying.simulation.model import POLAR, find, number
 from gaussian_swaying.simulation.simulation import Simulation, run_batch
-from gaussian_swaying.sweeps.dataset import PICTURES, write_contact_sheets
+from gaussian_swaying.sweeps.dataset import write_contact_sheets
 from gaussian_swaying.sweeps.plan import Plan, parse_run
 from gaussian_swaying.sweeps.record import (
     LOGS,
@@ -65,13 +65,8 @@ class Job:
     """A run to do, or several of equal shape that are simulated together.
 
     Args:
-        folder: Folder of the sweep.
-        names: Names of the runs.
         config: Configuration that all runs share, as YAML.
-        frames: Frames.
         runs: The value of every axis in each run.
-        device: Device of the simulation.
-        attempt: 1 for the first time.
         resume: Continue from the checkpoint of an earlier attempt, if there is one; not if there are several runs.
         complete: Names of runs that are done already, and only simulated along with the others.
     """
@@ -97,10 +92,9 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The outcome of a job.
+    """The result of each run of a job by name.
 
     Attributes:
-        results: The result of each of its runs, by name.
         killed: Whether its process was killed, so that the reason may be outside of it.
         ready: Whether its process can do another job. It should not after lack of memory, a bug or a signal.
     """
@@ -125,6 +119,7 @@ def work(job: Job, threads: int, explain: Explain, where: str = platform.node())
     """
     torch.set_num_threads(threads)
     told = io.StringIO()
+    results, status, ready = dict[str, dict[str, Any]](), "failed", True
     try:
         with stop_signals(), redirect_stdout(told), redirect_stderr(told):
             summaries = run_alone(job) if len(job.names) == 1 else run_together(job)
@@ -133,29 +128,27 @@ def work(job: Job, threads: int, explain: Explain, where: str = platform.node())
                 write_json(result_file(job.folder, name), result)
         return Outcome(results)
     except KeyboardInterrupt as stop:
-        return _failed(job, "failed", f"It was stopped ({stop or 'Ctrl-C'}).", ready=False)
+        reason, ready = f"It was stopped ({stop or 'Ctrl-C'}).", False
     except SimulationDiverged as error:
-        return _failed(job, "diverged", first_line(error))
+        reason, status = first_line(error), "diverged"
     except Exception as error:
         told.write(traceback.format_exc())
-        return _failed(job, "failed", explain(error), ready=isinstance(error, ValueError))
+        reason, ready = explain(error), isinstance(error, ValueError)
     finally:
         gc.collect()
         with suppress(OSError):
             if told.getvalue():
                 with (job.folder / LOGS / f"{job.names[0]}.txt").open("a", encoding="utf-8") as file:
                     file.write(told.getvalue())
-
-
-def _failed(job: Job, status: str, reason: str, **how: bool) -> Outcome:
-    return Outcome({name: failure(status, reason, job.attempt) for name in job.wanted}, **how)
+    return Outcome({name: failure(status, reason, job.attempt) for name in job.wanted}, ready=ready)
 
 
 def _lost(job: Job, reason: str) -> Outcome:
-    written = {name: result for name in job.wanted if (result := read_result(job.folder, name)) is not None}
+    """The outcome of a job whose process was killed, maybe after its last step."""
+    lost = {name: failure("failed", reason, job.attempt) for name in job.wanted}
+    written = {name: read_result(job.folder, name) or {"status": "none"} for name in job.wanted}
     done = {name: result for name, result in written.items() if result["status"] == "complete"}
-    lost = _failed(job, "failed", reason, killed=True, ready=False)
-    return replace(lost, results=lost.results | done)
+    return Outcome(lost | done, killed=True, ready=False)
 
 
 def _unlocked(do: Callable[[], Any]) -> Any:
@@ -242,37 +235,12 @@ def members_of(job: Job) -> list[Simulation]:
 
 
 # ---- processes
-class Pool(Protocol):
-    """Does jobs, several at a time. It knows nothing of plans, retries and tables.
-
-    Attributes:
-        workers: Jobs at a time.
-    """
-
-    workers: int
-
-    def submit(self, job: Job) -> Future[Outcome]:
-        """Begin a job."""
-
-    def outcome(self, job: Job, future: Future[Outcome]) -> Outcome:
-        """The outcome of a job that has ended, however it ended."""
-
-    def stop(self) -> None:
-        """Let all jobs end in order, at a frame."""
-
-    def close(self) -> None:
-        """Release all resources; no more jobs follow."""
-
-
 class Processes:
-    """A :class:`Pool` of loky's processes on this machine.
+    """Does jobs in loky's processes on this machine, several at a time; it knows nothing of plans, retries and tables.
 
     Each has an executor of its own: loky ends all processes of an executor if one of them is killed.
 
     Args:
-        workers: Processes at a time.
-        threads: Threads of torch in each.
-        explain: Makes a sentence of an error; a function of a module, as it is called in the workers.
         gpus: The GPUs as in ``CUDA_VISIBLE_DEVICES``; the workers take them in turn.
     """
 
@@ -283,6 +251,7 @@ class Processes:
         self._places: dict[Future[Outcome], int] = {}
 
     def submit(self, job: Job) -> Future[Outcome]:
+        """Begin a job."""
         place = self._free.pop(0)
         if place not in self._executors:
             environment = {"OMP_NUM_THREADS": str(self.threads), "GOMP_SPINCOUNT": os.getenv("GOMP_SPINCOUNT", "3000")}
@@ -299,6 +268,7 @@ class Processes:
         return future
 
     def outcome(self, job: Job, future: Future[Outcome]) -> Outcome:
+        """The outcome of a job that has ended, however it ended."""
         place = self._places.pop(future)
         self._free.insert(0, place)
         try:
@@ -319,6 +289,7 @@ class Processes:
             executor.shutdown()
 
     def stop(self) -> None:
+        """Let all jobs end in order, at a frame; an impatient second Ctrl-C kills them."""
         try:
             for executor in self._executors.values():
                 for process in list(executor._processes.values()):
@@ -355,7 +326,7 @@ def _without_ctrl_c() -> Iterator[None]:
 
 
 class Ray:
-    """A :class:`Pool` of Ray tasks; Ray places them and shows them.
+    """Does jobs as Ray tasks, as :class:`Processes` does.
 
     All machines must have this package, and see the folder of the sweep and the splats under the same paths.
 
@@ -363,11 +334,7 @@ class Ray:
         address: Of a cluster, as for ``ray.init``; ``local`` starts Ray on this machine.
         workers: Jobs at a time; as many as the cluster has room for if None.
         threads: Threads of each job, which Ray counts as CPUs.
-        explain: Makes a sentence of an error; a function of a module.
         gpu: The share of a GPU that a job takes.
-
-    Raises:
-        ValueError: If there is no cluster at the address.
     """
 
     def __init__(
@@ -429,7 +396,9 @@ def _task(job: Job, threads: int, explain: Explain, folder: str, path: list[str]
 
 
 # ---- all jobs
-def drive(jobs: Sequence[Job], pool: Pool, ended: Callable[[str, dict[str, Any]], None], retries: int = 1) -> None:
+def drive(
+    jobs: Sequence[Job], pool: Processes | Ray, ended: Callable[[str, dict[str, Any]], None], retries: int = 1
+) -> None:
     """Run jobs: a failed one is tried again, and one that fails too often does not stop the rest.
 
     A job of several runs that fails is done again run by run. If this is interrupted (Ctrl-C, or an exception of a
@@ -480,23 +449,19 @@ def run_sweep(
     threads: int | None = None,
     retries: int = 1,
     device: str = "auto",
-    picture: str = "last",
     explain: Explain = first_line,
     progress: bool = True,
-    started: Callable[[], None] = lambda: None,
     together: int = 1,
-    per_gpu: int = 1,
     ray: str | None = None,
     parquet: bool = False,
 ) -> dict[str, dict[str, Any]]:
     """Do all runs of a sweep that are not complete yet.
 
     Args:
-        workers: Runs at a time; None for ``per_gpu`` on each GPU, or one on each core.
+        workers: Runs at a time; None for one on each GPU, or core.
         threads: Threads of each; None for its share of the cores.
         retries: Number of times that a failed run is tried again; three times as often if its process was killed.
         device: ``auto``, ``cpu`` or ``cuda``, for every run.
-        picture: Frame of the contact sheet, ``last`` or ``middle``.
         explain: Makes a sentence of an error of a run; a function of a module.
         progress: Show a bar of runs, and a line for each failure.
         together: Largest number of runs of equal shape that are simulated together, as one job.
@@ -506,9 +471,8 @@ def run_sweep(
         The result of every run by name, as in ``results/``.
     """
     folder = Path(output).absolute()
-    check_choice("picture", picture, PICTURES)
     check_choice("device", device, ("auto", "cpu", "cuda"))
-    for name, count in (("workers", workers), ("threads", threads), ("together", together), ("per_gpu", per_gpu)):
+    for name, count in (("workers", workers), ("threads", threads), ("together", together)):
         if count is not None:
             check_whole(name, count, 1)
     check_whole("retries", retries, 0)
@@ -518,7 +482,6 @@ def run_sweep(
         check_extra("parquet", "pyarrow", "parquet")
     lock = open_folder(folder, plan, resume, together)
     try:
-        started()
         results = {name: result for name in plan.names if (result := read_result(folder, name)) is not None}
         done = frozenset(name for name, result in results.items() if result["status"] == "complete")
         jobs = []
@@ -538,13 +501,13 @@ def run_sweep(
                     tqdm.write(f"run {name} {result['status']}: {result['reason']}", file=sys.stderr)
             bar.update()
 
+        gpus = gpus_for(device)
         try:
             if jobs and ray is not None:
-                share = 1 / per_gpu if device == "cuda" or gpus_for(device) else 0.0
+                share = min(1.0, len(gpus) / (workers or 1)) or float(device == "cuda")
                 drive(jobs, Ray(ray, workers, threads or 1, explain, share), ended, retries)
             elif jobs:
-                gpus = gpus_for(device)
-                workers = workers or len(gpus) * per_gpu or cores()
+                workers = workers or len(gpus) or cores()
                 threads = threads or max(1, cores() // min(workers, len(jobs)))
                 drive(jobs, Processes(workers, threads, explain, gpus), ended, retries)
         finally:
@@ -553,7 +516,7 @@ def run_sweep(
                 if (result := read_result(folder, name)) is not None:
                     results[name] = result
             write_tables(folder, plan, results, parquet)
-        write_contact_sheets(folder, picture)
+        write_contact_sheets(folder)
         return results
     finally:
         lock.release()

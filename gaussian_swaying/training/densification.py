@@ -121,8 +121,7 @@ class Densification(ABC):
 class DefaultDensification(Densification):
     """Copy, split and prune by the gradient on the screen: gsplat's ``DefaultStrategy`` (Kerbl et al. 2023).
 
-    Works on any device. gsplat 1.5.3 never resets opacities, as its condition is never true; ``reset_opacity`` does it
-    here.
+    Works on any device. gsplat 1.5.3 never resets opacities, as its condition is never true.
 
     Args:
         start: Step after which Gaussians may change.
@@ -132,8 +131,7 @@ class DefaultDensification(Densification):
         grow_scale3d: Scale above which it is split rather than copied, as a share of the scene's extent.
         prune_opacity: Opacity below which it is removed.
         prune_scale3d: Scale above which it is removed after ``reset_every``, as a share of the scene's extent.
-        reset_every: Steps between resets of the opacities; large Gaussians are pruned after the first.
-        reset_opacity: Whether a reset lowers opacities to twice ``prune_opacity``.
+        reset_every: Steps after which large Gaussians are pruned.
         split_at: Step at which all large Gaussians are split, at ``stop`` or later (see
             :func:`~gaussian_swaying.gaussians.subdivision.split_large`); null for never. On a surface of one colour
             nothing else makes Gaussians small, and large ones blur the folds of moving cloth.
@@ -155,7 +153,6 @@ class DefaultDensification(Densification):
         prune_opacity: float = 0.005,
         prune_scale3d: float = 0.1,
         reset_every: int = 3000,
-        reset_opacity: bool = False,
         split_at: int | None = None,
         split_size: float = 0.008,
     ) -> None:
@@ -175,10 +172,7 @@ class DefaultDensification(Densification):
             check_positive(f"densification.{name}", value)
         if not 0.0 <= prune_opacity < 0.5:
             raise ValueError(f"Expected `densification.prune_opacity` from 0 to below 0.5, but got {prune_opacity}.")
-        if reset_opacity and prune_opacity == 0:
-            raise ValueError("Expected `densification.prune_opacity` above 0 with `reset_opacity`, but got 0.")
-        self.reset_opacity = reset_opacity
-        self.stop, self.reset_every, self.prune_opacity = stop, reset_every, float(prune_opacity)
+        self.stop = stop
         self._options: dict[str, Any] = {
             "refine_start_iter": start,
             "refine_stop_iter": stop,
@@ -239,10 +233,6 @@ class DefaultDensification(Densification):
         self._strategy.step_post_backward(
             parameters, self._optimizers, self._state, step, screen.info(), packed=screen.index is not None
         )
-        if self.reset_opacity and step > 0 and step % steps_of(self.reset_every, self.devices) == 0:
-            from gsplat.strategy.ops import reset_opa
-
-            reset_opa(parameters, self._optimizers, self._state, value=2.0 * self.prune_opacity)
 
 
 @cache

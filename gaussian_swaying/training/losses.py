@@ -11,81 +11,11 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying._checks import check_choice, check_positive
-from gaussian_swaying.metrics.ssim import PADDINGS, ssim_map
+from gaussian_swaying.metrics.ssim import ssim_map
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.planes import SurfaceMaps
 
 _MIN_OPACITY = 1e-7
-_REDUCTIONS = ("mean", "sum")
-
-
-def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2, padding: str = "valid") -> Tensor:
-    r"""Distance of two pictures, :math:`(1 - w)\,\lvert I - \hat I \rvert + w\,(1 - \mathrm{SSIM})` with w = 0.2.
-
-    Kerbl et al. 2023, equation 7: the :math:`\mathcal L_\mathrm{rgb}` of Gaussian Swaying.
-
-    Args:
-        image: Rendered picture, values from 0 to 1, shape (..., H, W, C).
-        target: Photo, of the same shape.
-        ssim_weight: Weight w of the structural part, 0 to 1.
-        padding: See :func:`ssim_map`. With ``valid``, each part is the mean over the pixels that it is defined for.
-    """
-    difference = (image - target).abs().mean()
-    if ssim_weight == 0.0:
-        return difference
-    return torch.lerp(difference, (1.0 - ssim_map(image, target, padding)).mean(), ssim_weight)
-
-
-def anisotropy_loss(log_scales: Tensor, a: float = 1.1, ratio: str = "paper", reduction: str = "mean") -> Tensor:
-    r"""Penalty on elongated Gaussians, :math:`\max(S^1 / S^2 - a, 0)` (Gaussian Swaying, "Training").
-
-    Args:
-        ratio: ``paper`` divides the largest by the second largest scale, so that discs are free; ``max_min`` (Xie et
-            al. 2024, "PhysGaussian") divides the largest by the smallest, which asks for balls.
-
-    Returns:
-        A number, 0 without Gaussians.
-
-    Example:
-        >>> anisotropy_loss(torch.tensor([[3.0, 2.0, 0.5]]).log())
-        tensor(0.4000)
-    """
-    x, y, z = log_scales.unbind(-1)
-    low, high = torch.minimum(x, y), torch.maximum(x, y)
-    largest = torch.maximum(high, z)
-    other = torch.maximum(low, torch.minimum(high, z)) if ratio == "paper" else torch.minimum(low, z)
-    return _reduce(((largest - other).exp() - a).clamp_min(0.0), reduction)
-
-
-def opacity_entropy_loss(opacities: Tensor, reduction: str = "mean") -> Tensor:
-    r"""Entropy of the opacities, :math:`-\sigma \log \sigma` (Gaussian Swaying, "Training"; Duan et al. 2024).
-
-    This is the literal formula. It pushes opacities above 1/e towards 1 and those below towards 0.
-
-    Args:
-        opacities: Opacities from 0 to 1, shape (N,); values below 1e-7 count as that, where the gradient is zero.
-
-    Returns:
-        A number, 0 without Gaussians.
-    """
-    clamped = opacities.clamp_min(_MIN_OPACITY)
-    return _reduce(-clamped * clamped.log(), reduction)
-
-
-def size_loss(log_scales: Tensor, b: float = 0.008, reduction: str = "mean") -> Tensor:
-    r"""Penalty on large Gaussians, :math:`\max(S^1 - b, 0)` of the largest scale (Gaussian Swaying, "Training").
-
-    Args:
-        b: Scale from which on a Gaussian counts as large [scene units].
-
-    Returns:
-        A number [scene units], 0 without Gaussians.
-    """
-    return _reduce((log_scales.amax(-1).exp() - b).clamp_min(0.0), reduction)
-
-
-def _reduce(values: Tensor, reduction: str) -> Tensor:
-    return values.mean() if reduction == "mean" and values.numel() else values.sum()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -170,72 +100,95 @@ class LossTerm(nn.Module, ABC):
 
 
 class PhotometricLoss(LossTerm):
-    """Distance between picture and photo, see :func:`photometric_loss`.
+    r"""Distance of picture and photo, :math:`(1 - w)\,\lvert I - \hat I \rvert + w\,(1 - \mathrm{SSIM})`.
+
+    Kerbl et al. 2023, equation 7: the :math:`\mathcal L_\mathrm{rgb}` of Gaussian Swaying. SSIM is the mean over the
+    windows inside the picture.
 
     Args:
-        ssim_weight: Weight of the structural part, 0 to 1.
-        padding: ``valid``, ``reflect`` or ``zeros``, see :func:`ssim_map`.
+        ssim_weight: Weight w of the structural part, 0 to 1.
 
     Raises:
-        ValueError: If an argument is not one of those.
+        ValueError: If it is out of range.
     """
 
-    def __init__(self, ssim_weight: float = 0.2, padding: str = "valid") -> None:
+    def __init__(self, ssim_weight: float = 0.2) -> None:
         super().__init__()
         if not 0.0 <= ssim_weight <= 1.0:
             raise ValueError(f"Expected `ssim_weight` between 0 and 1, but got {ssim_weight}.")
-        check_choice("padding", padding, PADDINGS)
-        self.ssim_weight, self.padding = float(ssim_weight), padding
+        self.ssim_weight = float(ssim_weight)
 
     def forward(self, inputs: LossInputs) -> Tensor:
-        return photometric_loss(inputs.image, inputs.target, self.ssim_weight, self.padding)
+        difference = (inputs.image - inputs.target).abs().mean()
+        if self.ssim_weight == 0.0:
+            return difference
+        return torch.lerp(difference, (1.0 - ssim_map(inputs.image, inputs.target)).mean(), self.ssim_weight)
 
 
-class AnisotropyLoss(LossTerm):
-    """Penalty on elongated Gaussians, see :func:`anisotropy_loss`.
-
-    Args:
-        a: Ratio from which a Gaussian counts as elongated, at least 1.
-        ratio: ``paper`` (largest over second largest scale) or ``max_min``.
-        reduction: ``mean`` or ``sum`` over the Gaussians.
-
-    Raises:
-        ValueError: If an argument is not one of those.
-    """
-
-    def __init__(self, a: float = 1.1, ratio: str = "paper", reduction: str = "mean") -> None:
-        super().__init__()
-        if not 1.0 <= a < math.inf:
-            raise ValueError(f"Expected `a` to be at least 1, but got {a}.")
-        check_choice("ratio", ratio, ("paper", "max_min"))
-        check_choice("reduction", reduction, _REDUCTIONS)
-        self.a, self.ratio, self.reduction = float(a), ratio, reduction
-
-    def forward(self, inputs: LossInputs) -> Tensor:
-        return anisotropy_loss(inputs.log_scales, self.a, self.ratio, self.reduction)
-
-
-class OpacityEntropyLoss(LossTerm):
-    """Entropy of the opacities, see :func:`opacity_entropy_loss`.
+class OfGaussians(LossTerm):
+    """Base class of terms that are a mean or a sum over the Gaussians.
 
     Args:
-        reduction: ``mean`` or ``sum`` over the Gaussians.
+        reduction: ``mean`` or ``sum``; 0 without Gaussians.
 
     Raises:
-        ValueError: If ``reduction`` is none of those.
+        ValueError: If it is none of those.
     """
 
     def __init__(self, reduction: str = "mean") -> None:
         super().__init__()
-        check_choice("reduction", reduction, _REDUCTIONS)
+        check_choice("reduction", reduction, ("mean", "sum"))
         self.reduction = reduction
 
+    @abstractmethod
+    def of_each(self, inputs: LossInputs) -> Tensor:
+        """The term of each Gaussian, shape (N,)."""
+
     def forward(self, inputs: LossInputs) -> Tensor:
-        return opacity_entropy_loss(inputs.opacities, self.reduction)
+        values = self.of_each(inputs)
+        return values.mean() if self.reduction == "mean" and values.numel() else values.sum()
 
 
-class SizeLoss(LossTerm):
-    """Penalty on large Gaussians, see :func:`size_loss`.
+class AnisotropyLoss(OfGaussians):
+    r"""Penalty on elongated Gaussians, :math:`\max(S^1 / S^2 - a, 0)` (Gaussian Swaying, "Training").
+
+    The largest over the second largest scale, so that discs are free.
+
+    Args:
+        a: Ratio from which a Gaussian counts as elongated, at least 1.
+        reduction: ``mean`` or ``sum`` over the Gaussians.
+
+    Raises:
+        ValueError: If an argument is not one of those.
+    """
+
+    def __init__(self, a: float = 1.1, reduction: str = "mean") -> None:
+        super().__init__(reduction)
+        if not 1.0 <= a < math.inf:
+            raise ValueError(f"Expected `a` to be at least 1, but got {a}.")
+        self.a = float(a)
+
+    def of_each(self, inputs: LossInputs) -> Tensor:
+        x, y, z = inputs.log_scales.unbind(-1)
+        low, high = torch.minimum(x, y), torch.maximum(x, y)
+        second = torch.maximum(low, torch.minimum(high, z))
+        return ((torch.maximum(high, z) - second).exp() - self.a).clamp_min(0.0)
+
+
+class OpacityEntropyLoss(OfGaussians):
+    r"""Entropy of the opacities, :math:`-\sigma \log \sigma` (Gaussian Swaying, "Training"; Duan et al. 2024).
+
+    This is the literal formula. It pushes opacities above 1/e towards 1 and those below towards 0. Opacities below 1e-7
+    count as that, where the gradient is zero.
+    """
+
+    def of_each(self, inputs: LossInputs) -> Tensor:
+        clamped = inputs.opacities.clamp_min(_MIN_OPACITY)
+        return -clamped * clamped.log()
+
+
+class SizeLoss(OfGaussians):
+    r"""Penalty on large Gaussians, :math:`\max(S^1 - b, 0)` of the largest scale (Gaussian Swaying, "Training").
 
     The paper does not say how the penalty is summed over the Gaussians. As a mean with the paper's weight of 0.01 it
     has no measurable effect. As a sum it limits the Gaussians to ``b``. A simulation needs this where a surface has no
@@ -250,27 +203,26 @@ class SizeLoss(LossTerm):
     """
 
     def __init__(self, b: float = 0.008, reduction: str = "mean") -> None:
-        super().__init__()
+        super().__init__(reduction)
         check_positive("b", b, allow_zero=True)
-        check_choice("reduction", reduction, _REDUCTIONS)
-        self.b, self.reduction = float(b), reduction
+        self.b = float(b)
 
-    def forward(self, inputs: LossInputs) -> Tensor:
-        return size_loss(inputs.log_scales, self.b, self.reduction)
+    def of_each(self, inputs: LossInputs) -> Tensor:
+        return (inputs.log_scales.amax(-1).exp() - self.b).clamp_min(0.0)
 
 
-class MeanOpacityLoss(LossTerm):
+class MeanOpacityLoss(OfGaussians):
     """Mean opacity. Kheradmand et al. 2024 ("3DGS as Markov Chain Monte Carlo") add it so that Gaussians can fade."""
 
-    def forward(self, inputs: LossInputs) -> Tensor:
-        return _reduce(inputs.opacities, "mean")
+    def of_each(self, inputs: LossInputs) -> Tensor:
+        return inputs.opacities
 
 
-class MeanScaleLoss(LossTerm):
+class MeanScaleLoss(OfGaussians):
     """Mean standard deviation [scene units], the other term of Kheradmand et al. 2024."""
 
-    def forward(self, inputs: LossInputs) -> Tensor:
-        return _reduce(inputs.log_scales.exp(), "mean")
+    def of_each(self, inputs: LossInputs) -> Tensor:
+        return inputs.log_scales.exp().flatten()
 
 
 DEFAULT_WEIGHTS = {"rgb": 1.0, "anisotropy": 10.0, "entropy": 0.01, "size": 0.01}

@@ -1,7 +1,7 @@
-"""Losses of the surface in a picture: normals against depths, and one view against another.
+"""Losses of the surface in a picture, one view against another.
 
-The normal that follows from depths removes noise, but makes normals agree with whatever surface there is. Only other
-views tell where the surface is: a point of it must look the same from both (Chen et al. 2024, "PGSR", section 3.3).
+Only other views tell where the surface is: a point of it must look the same from both (Chen et al. 2024, "PGSR",
+section 3.3).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from gaussian_swaying._checks import check_positive
 from gaussian_swaying.rendering.cameras.camera import Camera
-from gaussian_swaying.rendering.planes import SurfaceMaps, depth_normals
+from gaussian_swaying.rendering.planes import SurfaceMaps
 from gaussian_swaying.training.losses import LossInputs, LossTerm, OtherView
 
 _GREY = (0.299, 0.587, 0.114)
@@ -24,48 +24,6 @@ _GREY = (0.299, 0.587, 0.114)
 def grey(image: Tensor) -> Tensor:
     """Brightness of a picture (H, W, 3) as (H, W)."""
     return image @ image.new_tensor(_GREY)
-
-
-# ---- one view
-
-
-def edge_weight(image: Tensor) -> Tensor:
-    r"""Return a weight that falls with the image gradient, :math:`(1 - |\nabla I|)^2`, relative to its largest value.
-
-    Chen et al. 2024 (PGSR), equation 9: depths may jump where colours do.
-
-    Args:
-        image: The photo, shape (H, W, 3).
-
-    Returns:
-        Weights from 0 to 1 without gradient, shape (H, W, 1); 0 at the border.
-    """
-    bright = grey(image.detach())
-    across = 0.5 * (bright[1:-1, 2:] - bright[1:-1, :-2])
-    down = 0.5 * (bright[2:, 1:-1] - bright[:-2, 1:-1])
-    steep = torch.hypot(across, down)
-    weight = (1.0 - steep / steep.amax().clamp_min(1e-6)).square()
-    return functional.pad(weight, (1, 1, 1, 1))[..., None]
-
-
-def depth_normal_loss(maps: SurfaceMaps, camera: Camera, weight: Tensor | None = None) -> Tensor:
-    r"""Distance of rendered normals from those of the rendered depths, :math:`1 - n \cdot n_d`.
-
-    Huang et al. 2024 ("2D Gaussian Splatting"), equation 14, with the blended normal divided by its length.
-
-    Args:
-        weight: Weight of each pixel, shape (H, W, 1); equal weights when None.
-
-    Returns:
-        The weighted mean over the pixels that show a surface; 0 if there is none.
-    """
-    normal, inner = depth_normals(maps.depth, maps.known, camera)
-    share = inner.to(normal.dtype) if weight is None else inner * weight
-    apart = 1.0 - (normal * maps.unit).sum(-1, keepdim=True)
-    return (share * apart).sum() / share.sum().clamp_min(1e-6)
-
-
-# ---- two views
 
 
 def relative_pose(camera: Camera, other: Camera) -> tuple[Tensor, Tensor]:
@@ -222,27 +180,6 @@ class SurfaceTerm(LossTerm):
         if fade and stop is None:
             raise ValueError("Expected `stop` with `fade`: set the number of images after which the weight is zero.")
         self.start, self.stop, self.fade, self.every = int(start), stop, int(fade), int(every)
-
-
-class DepthNormalLoss(SurfaceTerm):
-    """Rendered normals against those of rendered depths, see :func:`depth_normal_loss`.
-
-    Args:
-        start: See :class:`SurfaceTerm`.
-        edges: Weigh pixels by :func:`edge_weight`.
-        when: Further arguments of :class:`SurfaceTerm`.
-
-    Raises:
-        ValueError: If a number is out of range.
-    """
-
-    def __init__(self, start: int = 7000, edges: bool = True, **when: Any) -> None:
-        super().__init__(start, **when)
-        self.edges = bool(edges)
-
-    def forward(self, inputs: LossInputs) -> Tensor:
-        maps, camera = surface_of(inputs)
-        return depth_normal_loss(maps, camera, edge_weight(inputs.target) if self.edges else None)
 
 
 class MultiViewGeometricLoss(SurfaceTerm):

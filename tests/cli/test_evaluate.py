@@ -6,13 +6,12 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from shared import SMALL, refused, small_network, words
+from shared import SMALL, refused, words
 
 from gaussian_swaying.cli.evaluate import main
 from gaussian_swaying.cli.simulate import main as simulate
 from gaussian_swaying.recording.trajectory import load_trajectory
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
 SIDE = 1.2
 CENTRE = torch.tensor([0.6, 0.0, 0.4])  # of the flag's box, where the simulation has its origin
 
@@ -59,16 +58,12 @@ def test_a_run_beside_a_reference(folders, tmp_path, capsys):
 
 def test_options(folders, tmp_path):
     run, reference = folders
-    network = small_network(tmp_path / "network.pt")
     command = [str(run), str(reference), "--output", str(tmp_path / "out"), "--device", "cpu", "--no-video"]
     command += ["--reference-offset", "1", "--frames", "3", "--side", "2", "--points", "50", "--seed", "7"]
-    command += ["--i3d", str(network), "--clip-length", "2", "--clip-stride", "1", "--resize", "8"]
     assert main(command) == 0
     result = json.loads((tmp_path / "out/eval.json").read_text())
     assert [row["reference_frame"] for row in result["per_frame"]] == [1, 2, 3]
     assert (result["side_m"], result["reference_points"], result["run_points"], result["seed"]) == (2.0, 50, 50, 7)
-    fvd = result["fvd"]
-    assert (fvd["clip_length"], fvd["stride"], fvd["resize"], fvd["real_clips"]) == (2, 1, [8, 8], 2)
     assert not (tmp_path / "out/comparison.mp4").exists()
 
 
@@ -78,7 +73,6 @@ def test_options(folders, tmp_path):
         (["nowhere", "REFERENCE"], ["The run folder nowhere does not exist", "folder of a simulation"]),
         (["RUN", "nowhere"], ["The reference folder nowhere does not exist"]),
         (["RUN", "REFERENCE", "--reference-offset", "1"], ["4 pictures in", "--frames 3"]),
-        (["RUN", "REFERENCE", "--i3d", "i3d.pt"], ["There is no file i3d.pt", "none is downloaded"]),
         (["RUN", "REFERENCE", "--points", "0"], ["`points`", "positive"]),
     ],
 )

@@ -5,7 +5,6 @@ import json
 import math
 import re
 import shlex
-import struct
 from pathlib import Path
 
 import pytest
@@ -253,19 +252,3 @@ def test_bad_input_is_one_sentence(splat, tmp_path, capsys):
         (splat, ["--config", str(tmp_path / "none.yaml")], "none.yaml"),
     ):
         check_refused(scene, tmp_path, capsys, *options, words=words)
-
-
-def test_a_note_on_infinite_opacities_is_for_the_preview_alone(tmp_path, capsys):
-    """Once, though the file is read again for the scene; a run of the splat does not repeat it."""
-    cloud = FlagScene(spacing=0.1).generate()
-    write_ply(tmp_path / "flag.ply", dataclasses.replace(cloud, opacities=torch.full_like(cloud.opacities, 400.0)))
-    content = (tmp_path / "flag.ply").read_bytes()
-    (tmp_path / "flag.ply").write_bytes(content.replace(struct.pack("<f", 400.0), struct.pack("<f", math.inf)))
-    assert preview(tmp_path / "flag.ply", tmp_path / "out", "--frames", "2") == 0
-    note = f"note: the opacity of {len(cloud)} is exactly 0 or 1, an infinite logit, which is read as ±16\n"
-    told, said = capsys.readouterr()
-    assert told.count(note) == 1
-    assert "opacity" not in said
-    small = ["--camera.init_args.width=16", "--camera.init_args.height=9", "--device=cpu", "--frames=1"]
-    assert simulate(["--config", str(tmp_path / "out/starter.yaml"), *small, f"--output={tmp_path / 'run'}"]) == 0
-    assert "infinite logit" not in "".join(capsys.readouterr())

@@ -5,21 +5,14 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from shared import small_network, value_error
+from shared import value_error
 
 from gaussian_swaying.evaluation.compare import compare_run, evaluate, table
 from gaussian_swaying.evaluation.reference import surface_points
 from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.metrics.frechet_video import FrechetVideoDistance
 
 HEIGHT, WIDTH = 16, 24
-pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
 POINTS = 2000
-
-
-@pytest.fixture
-def network(tmp_path):
-    return FrechetVideoDistance(small_network(tmp_path / "network.pt"), clip_length=2, resize=8)
 
 
 @pytest.fixture
@@ -145,22 +138,7 @@ def test_pictures_or_surfaces_alone(make_run, make_reference):
     found = compare_run(run, make_reference("surfaces", pictures=False), points=100)
     assert "psnr_db" not in found["mean"]
     assert found["size"] is None
-    assert "Not compared: pictures" in table(found)
-
-
-def test_fvd_with_its_protocol(make_run, make_reference, network):
-    run, reference = make_run(change=5), make_reference()
-    found = compare_run(run, reference, points=100, fvd=network)
-    again = FrechetVideoDistance(network.weights, clip_length=2, resize=8)
-    for folder, real in ((reference, True), (run, False)):
-        frames = [torch.from_numpy(iio.imread(path)) for path in sorted((folder / "frames").iterdir())]
-        again.update(torch.stack(frames).permute(0, 3, 1, 2) / 255, real=real)
-    assert found["fvd"]["fvd"] == pytest.approx(float(again.compute()))
-    assert found["fvd"]["fvd"] > 1e-3
-    assert found["fvd"]["weights_sha256"] == network.sha256
-    assert f"weights_sha256 {network.sha256}" in table(found)
-    # what it saw before is forgotten
-    assert compare_run(run, reference, points=100, fvd=network)["fvd"] == found["fvd"]
+    assert "skipped: ['pictures: " in table(found)
 
 
 @pytest.mark.gpu
@@ -179,8 +157,8 @@ def test_files(make_run, make_reference, tmp_path):
     assert json.loads((tmp_path / "a/b/eval.json").read_text()) == result
     text = (tmp_path / "a/b/eval.md").read_text()
     assert text == table(result)
-    assert f"{result['mean']['psnr_db']:.2f}" in text
-    assert f"{100 * result['chamfer_share']:.2f}" in text
+    assert f"{result['mean']['psnr_db']:.5g}" in text
+    assert f"chamfer_share: {result['chamfer_share']}" in text
     video = iio.imread(tmp_path / "a/b/comparison.mp4")
     assert video.shape[0] == 4
     assert video.shape[2] >= 3 * WIDTH
@@ -289,14 +267,6 @@ def test_nothing_to_compare(make_run, make_reference, tmp_path):
         compare_run(run, tmp_path / "nowhere")
     with value_error(r"Nothing can be compared \(pictures: .*; surface: there is no .*cloth\.npz"):
         compare_run(run, make_reference(cloth=False, pictures=False))
-
-
-def test_fvd_without_what_it_needs(make_run, make_reference, network):
-    run = make_run()
-    with value_error("needs pictures"):
-        compare_run(run, make_reference(pictures=False), fvd=network)
-    with value_error("Two clips of 2 frames need 3 frames, but 2 are compared"):
-        compare_run(run, make_reference("other"), frames=2, fvd=network)
 
 
 @pytest.mark.parametrize("option", ["points", "frames", "side"])

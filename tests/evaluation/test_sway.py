@@ -35,8 +35,7 @@ def sine(hertz, phase=0.0):
 
 def test_a_pole_that_rocks(rest):
     """The upper tenth is at shares of 0.9 to 1 of the tip; the side is that of the moving 0.38 m to 2 m."""
-    held = rest[:, 2] < 0.2
-    score = sway_score(rest, bent(rest, x=0.3 + 0.1 * sine(1.5)), TIMES, still=held)
+    score = sway_score(rest, bent(rest, x=0.3 + 0.1 * sine(1.5)), TIMES)
     side, share = 0.98 * (2 - (0.2 + 0.1 * 1.8)), 0.955
     assert score.side == pytest.approx(side, rel=0.02)
     assert score.moving_share == pytest.approx(0.81, abs=0.03)
@@ -45,10 +44,8 @@ def test_a_pole_that_rocks(rest):
     assert score.ratio == pytest.approx(1 / (3 * math.sqrt(2)), rel=0.02)
     assert score.peak == pytest.approx(1.5, abs=1 / (4 * 8))
     assert score.peak_share > 0.98
-    assert score.together == pytest.approx(1, abs=1e-6)
     assert score.cross < 1e-6
     assert score.drift < 0.03
-    assert score.still == 0
     assert 0 <= score.stiller < 0.02
 
 
@@ -56,14 +53,13 @@ def test_tensors_give_the_same_score(rest):
     moved = bent(rest, x=0.3 + 0.1 * sine(1.5))
     as_tensors = sway_score(*(torch.from_numpy(values) for values in (rest, moved, TIMES)))
     assert as_tensors == pytest.approx(sway_score(rest, moved, TIMES), nan_ok=True)
-    assert math.isnan(as_tensors.still)
 
 
 def test_the_score_does_not_depend_on_units_or_axes(rest):
     moved = bent(rest, x=0.3 + 0.1 * sine(1.5), y=0.04 * sine(0.9))
     turned = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0][[2, 0, 1]]
     plain, other = sway_score(rest, moved, TIMES), sway_score(7 * rest, 7 * moved @ turned, TIMES)
-    for name in ("peak", "peak_share", "ratio", "drift", "together", "cross", "moving_share"):
+    for name in ("peak", "peak_share", "ratio", "drift", "cross", "moving_share"):
         assert getattr(other, name) == pytest.approx(getattr(plain, name), rel=1e-6), name
     assert other.lean * other.side == pytest.approx(7 * plain.lean * plain.side)
 
@@ -73,25 +69,11 @@ def test_the_tip_goes_round_an_ellipse(rest):
     assert score.cross == pytest.approx(0.5, abs=0.01)
 
 
-def test_halves_out_of_phase(rest):
-    moved = bent(rest, x=0.1) + np.array([0, 0.1, 0]) * sine(1.2)[:, None, None]
-    moved[:, rest[:, 2] < 1] *= [1, -1, 1]
-    score = sway_score(rest, moved, TIMES)
-    assert score.together < 0
-    assert score.peak == pytest.approx(1.2, abs=1 / (4 * 8))
-
-
 def test_what_creeps_drifts(rest):
     """From 2 s to 10 s the mean of the halves is that at 4 s and 8 s: 4 / 6 of the mean at 6 s."""
     creeping = sway_score(rest, bent(rest, x=0.05 * TIMES), TIMES)
     assert creeping.drift == pytest.approx(4 / 6, rel=0.01)
     assert sway_score(rest, bent(rest, x=0.2 + 0 * TIMES), TIMES).drift < 1e-9
-
-
-def test_still_points_that_move_are_told(rest):
-    moved = bent(rest, x=0.3 + 0.1 * sine(1.5))
-    score = sway_score(rest, moved, TIMES, still=rest[:, 2] < 0.29)
-    assert score.still == pytest.approx(0.05 * 0.4 / score.side, rel=0.05)
 
 
 def test_what_stands_still_has_no_score(rest):
@@ -133,4 +115,4 @@ device: cpu
     done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
     score = json.loads(done.stdout)
     assert 0.2 < score["side"] < 0.4
-    assert score["still"] is None
+    assert score["ratio"] > 0

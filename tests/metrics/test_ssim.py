@@ -24,10 +24,9 @@ def test_ssim_equals_torchmetrics(device):
 def test_ssim_of_equal_pictures_is_one_and_padding_keeps_the_size():
     x, y = _pictures()
     assert_close(ssim_map(x, x), torch.ones(14, 21, 3).double())
-    for padding in ("reflect", "zeros"):
-        padded = ssim_map(x, y, padding)
-        assert padded.shape == x.shape
-        assert_close(padded[5:-5, 5:-5], ssim_map(x, y))
+    padded = ssim_map(x, y, "reflect")
+    assert padded.shape == x.shape
+    assert_close(padded[5:-5, 5:-5], ssim_map(x, y))
     batch = ssim_map(torch.stack([x, y]), torch.stack([y, y]))
     assert_close(batch, torch.stack([ssim_map(x, y), ssim_map(y, y)]))
 

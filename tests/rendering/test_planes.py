@@ -6,7 +6,7 @@ from shared import double, near, peak, rand, seeded
 
 from gaussian_swaying.geometry.rotations import rotation_from_z, rotation_to_quat
 from gaussian_swaying.rendering.cameras.camera import look_at_camera
-from gaussian_swaying.rendering.planes import depth_normals, pixel_rays, plane_channels, surface_maps
+from gaussian_swaying.rendering.planes import pixel_rays, plane_channels, surface_maps
 from gaussian_swaying.rendering.torch_renderer import TorchRenderer
 
 NORMAL = torch.nn.functional.normalize(double([0.3, -1.0, 0.2]), dim=0)
@@ -56,21 +56,6 @@ def test_discs_of_a_plane_show_that_plane():
     near(maps.unit[known], facing.expand(int(known.sum()), 3), 1e-6)
     assert (maps.distance[known] < 0).all()
     assert maps.depth[~known].eq(0).all()
-
-
-def test_normals_of_depths_are_those_of_the_plane():
-    camera = _camera()
-    known = torch.ones(camera.height, camera.width, 1, dtype=torch.bool)
-    known[10, 12] = False
-    normal, inner = depth_normals(_true_depth(camera)[..., None], known, camera)
-    assert not inner[[0, -1]].any()
-    assert not inner[:, [0, -1]].any()
-    assert not inner[9:12, 12].any()
-    assert not inner[10, 11:14].any()
-    assert int(inner.sum()) == (camera.height - 2) * (camera.width - 2) - 5
-    facing = camera.world_to_camera[:3, :3] @ NORMAL
-    found = normal[inner[..., 0]]
-    near(found, facing.expand(len(found), 3), 1e-9)
 
 
 def test_a_picture_without_gaussians_shows_no_surface():

@@ -6,7 +6,7 @@ from gaussian_swaying.sweeps.plan import read_axis, runs_of
 
 
 def _runs(axes, **more):
-    return runs_of([read_axis(name, given) for name, given in axes.items()], **more)
+    return runs_of({name: read_axis(name, given) for name, given in axes.items()}, **more)
 
 
 def test_lists_and_ranges_are_combined():
@@ -16,10 +16,10 @@ def test_lists_and_ranges_are_combined():
 
 
 def test_ranges_reach_both_ends():
-    (first, *_, last) = read_axis("E", {"from": 0.1, "to": "7e3", "count": 6, "scale": "log"}).values
+    (first, *_, last) = read_axis("E", {"from": 0.1, "to": "7e3", "count": 6, "scale": "log"})
     assert (first, last) == (0.1, 7000.0)
-    values = read_axis("E", {"from": 1, "to": 1000, "count": 4, "scale": "log"}).values
-    assert values == (1.0, 10.0, 100.0, 1000.0)
+    values = read_axis("E", {"from": 1, "to": 1000, "count": 4, "scale": "log"})
+    assert values == [1.0, 10.0, 100.0, 1000.0]
 
 
 def test_draws_do_not_depend_on_other_axes():
@@ -61,7 +61,7 @@ def test_each_combination_is_drawn():
         ([], ("axes.E", "empty")),
         (3.0, ("axes.E", "[3.0]")),
         ({"from": 1, "to": 2}, ("axes.E.count", "whole number")),
-        ({"from": 1, "to": 2, "count": 1}, ("axes.E.count", "use a list")),
+        ({"from": 1, "to": 2, "count": 1}, ("axes.E.count", "at least 2")),
         ({"from": "much", "to": 2, "count": 3}, ("axes.E.from", "'much'")),
         ({"from": 1, "to": float("inf"), "count": 3}, ("axes.E.to", "finite")),
         ({"from": -1, "to": 2, "count": 3, "scale": "log"}, ("axes.E.from", "scale: linear")),

@@ -62,7 +62,7 @@ def test_a_sweep_on_all_gpus(tmp_path, sweep_file):
     for result in (folder / "results").iterdir():
         assert json.loads(result.read_text())["peak_memory_bytes"]["device"] > 0
     again = tmp_path / "again"
-    assert main([str(file), "--output", str(again), "--together", "4", "--device", "cuda", "--per-gpu", "2"]) == 0
+    assert main([str(file), "--output", str(again), "--together", "4", "--device", "cuda", "--workers", "2"]) == 0
     assert (again / "sweep.csv").read_bytes() == (folder / "sweep.csv").read_bytes()
 
 

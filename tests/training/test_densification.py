@@ -76,15 +76,6 @@ def test_all_gaussians_at_once():
     assert densification.state_dict()["count"].tolist() == [1, 0, 1, 0, 1, 1]
 
 
-def test_opacities_are_reset_only_if_asked_for():
-    for reset in (False, True):
-        model = _model()
-        densification = DefaultDensification(reset_every=4, reset_opacity=reset)
-        densification.attach(model, _optimizer(model), 1.0)
-        densification.after_step(4, _screen([0.0], [0]))
-        assert float(model.opacity().detach().max()) == pytest.approx(0.01 if reset else 0.5, rel=0.01)
-
-
 def test_what_needs_cuda_says_so():
     model = _model()
     with value_error(r"MCMCDensification needs CUDA.*use DefaultDensification"):

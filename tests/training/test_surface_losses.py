@@ -15,13 +15,11 @@ from gaussian_swaying.rendering.planes import SurfaceMaps, pixel_rays
 from gaussian_swaying.training.losses import LossInputs, OtherView, TotalLoss
 from gaussian_swaying.training.module import SplatTrainer
 from gaussian_swaying.training.surface_losses import (
-    DepthNormalLoss,
     MultiViewGeometricLoss,
     MultiViewPhotometricLoss,
+    SurfaceTerm,
     chosen_pixels,
     cross_correlation,
-    depth_normal_loss,
-    edge_weight,
     round_trip,
     sample,
     textured,
@@ -212,42 +210,6 @@ def test_derivatives_against_finite_differences():
         patches, (start.clone().requires_grad_(), start_distance.clone().requires_grad_()), eps=1e-8, atol=1e-3
     )
 
-    def consistency(depth, unit):
-        return depth_normal_loss(replace(plane, normal=unit, unit=unit, depth=depth), camera)
-
-    crop = torch.linspace(0, 1, SIZE, dtype=torch.float64)
-    bumpy = plane.depth + 0.002 * torch.sin(9 * crop)[:, None, None]
-    depth, unit = bumpy.clone().requires_grad_(), plane.unit.clone().requires_grad_()
-    consistency(depth, unit).backward()
-    for tensor, place in ((depth, (30, 40, 0)), (unit, (31, 50, 1))):
-        values = []
-        for step in (1e-6, -1e-6):
-            moved = [depth.detach().clone(), unit.detach().clone()]
-            moved[0 if tensor is depth else 1][place] += step
-            values.append(float(consistency(*moved)))
-        assert float(tensor.grad[place]) == pytest.approx((values[0] - values[1]) / 2e-6, rel=1e-3, abs=1e-9)
-
-
-def test_normals_that_fit_their_depths_cost_nothing():
-    camera = _camera(0.6)
-    assert depth_normal_loss(_plane(camera), camera) < 1e-12
-    tilted = _plane(camera, tilt=0.2)
-    mixed = replace(tilted, depth=_plane(camera).depth)
-    assert float(depth_normal_loss(mixed, camera)) == pytest.approx(1 - math.cos(0.2), rel=1e-6)
-    none = replace(tilted, known=torch.zeros_like(tilted.known))
-    assert depth_normal_loss(none, camera) == 0.0
-    term = DepthNormalLoss(0)
-    assert float(term(_inputs(surface=mixed))) == pytest.approx(1 - math.cos(0.2), rel=1e-6)
-
-
-def test_weights_of_edges():
-    image = torch.zeros(9, 12, 3)
-    image[:, 6:] = 1.0
-    weight = edge_weight(image)
-    assert weight[4, 2] == 1.0
-    assert weight[4, 6] == 0.0
-    assert weight[0].eq(0).all()
-
 
 def test_correlations():
     one = torch.rand(4, 25)
@@ -287,27 +249,34 @@ def test_neighbours_show_the_same_place_from_another():
     assert neighbouring_views([]) == []
 
 
+class _Surface(SurfaceTerm):
+    """A term that needs the surface, and no other view: it should be flat."""
+
+    def forward(self, inputs):
+        return inputs.surface.depth.std() + inputs.surface.unit.std(0).sum()
+
+
 def test_terms_begin_at_their_step_and_say_what_they_need():
     loss = TotalLoss(
-        {"normal": DepthNormalLoss(start=5), "views": MultiViewPhotometricLoss(start=8)}, {"views": 0.2, "normal": 0.1}
+        {"surface": _Surface(start=5), "views": MultiViewPhotometricLoss(start=8)}, {"views": 0.2, "surface": 0.1}
     )
     assert loss.needs(4) == frozenset()
     assert loss.needs(5) == {"surface"}
     assert loss.needs(8) == {"surface", "other_view"}
     inputs = _inputs(tilt=0.01, log_scales=torch.zeros(1, 3), opacities=torch.ones(1), step=6)
     total, values = loss(inputs)
-    assert set(values) == {"rgb", "anisotropy", "entropy", "size", "normal"}
+    assert set(values) == {"rgb", "anisotropy", "entropy", "size", "surface"}
     assert torch.isfinite(total)
     with value_error(r"LossInputs\.surface"):
-        DepthNormalLoss(0)(_inputs(surface=None))
+        MultiViewGeometricLoss(0)(_inputs(surface=None))
     with value_error("radius"):
         MultiViewPhotometricLoss(radius=0)
     with value_error("start"):
-        DepthNormalLoss(start=-1)
+        MultiViewGeometricLoss(start=-1)
 
 
 TERMS = {
-    "normal": DepthNormalLoss(start=2),
+    "surface": _Surface(start=2),
     "geometric": MultiViewGeometricLoss(start=3, samples=200, farthest=4.0),
     "photometric": MultiViewPhotometricLoss(start=3, samples=200, farthest=4.0),
 }
@@ -335,7 +304,7 @@ def _train(data, make_trainer, terms):
 def test_a_training_with_all_terms(data, make_trainer):
     module, logged = _train(data, make_trainer, TERMS)
     begun = [{name for name in TERMS if f"train/{name}" in row} for row in logged if "train/loss" in row]
-    assert begun[:4] == [set(), set(), {"normal"}, set(TERMS)]
+    assert begun[:4] == [set(), set(), {"surface"}, set(TERMS)]
     assert all(row["train/photometric"] > 0 for row in logged[4:] if "train/loss" in row)
     for name, term in TERMS.items():
         without, _ = _train(data, make_trainer, {key: value for key, value in TERMS.items() if value is not term})
@@ -361,7 +330,7 @@ def test_a_training_with_all_terms_on_a_gpu(data, make_trainer):
     ],
 )
 def test_bad_times_of_terms(options, words):
-    for kind in (DepthNormalLoss, MultiViewGeometricLoss, MultiViewPhotometricLoss):
+    for kind in (MultiViewGeometricLoss, MultiViewPhotometricLoss):
         with value_error(words):
             kind(**options)
 
