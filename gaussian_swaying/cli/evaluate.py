@@ -32,6 +32,11 @@ def build_parser() -> argparse.ArgumentParser:
     add("--seed", type=int, default=0, help="seed of the points")
     add("--no-video", action="store_true", help="do not make comparison.mp4")
     add("--device", **DEVICE)
+    fvd = parser.add_argument_group("Fréchet video distance")
+    fvd.add_argument("--i3d", metavar="FILE", help="I3D network as TorchScript; without it there is no FVD")
+    fvd.add_argument("--clip-length", type=int, default=16, help="frames in a clip")
+    fvd.add_argument("--clip-stride", type=int, default=1, help="frames between the starts of clips")
+    fvd.add_argument("--resize", type=int, default=224, help="side of the frames given to the network [pixels]")
     return parser
 
 
@@ -51,12 +56,18 @@ def compare(options: argparse.Namespace) -> None:
 
     output = Path(options.output or Path(options.run) / "eval")
     device = resolve_device(options.device)
+    network = None
+    if options.i3d:
+        from gaussian_swaying.metrics.frechet_video import FrechetVideoDistance  # torchmetrics takes seconds to load
+
+        network = FrechetVideoDistance(options.i3d, options.clip_length, options.clip_stride, options.resize)
     result = evaluate(
         options.run,
         options.reference,
         output,
         video=not options.no_video,
         device=device,
+        fvd=network,
         progress=sys.stderr.isatty(),
         **{name: getattr(options, name) for name in ("reference_offset", "frames", "side", "points", "seed")},
     )

@@ -1,4 +1,4 @@
-"""Comparison of a run with a reference, frame by frame: pictures and surface."""
+"""Comparison of a run with a reference, frame by frame: pictures, surface and, with a network, video."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from einops import rearrange
 from torch import Tensor
 from tqdm import tqdm
 
@@ -28,6 +29,9 @@ from gaussian_swaying.metrics.nearest import nearest_distances
 from gaussian_swaying.metrics.ssim import SSIM_TAPS, ssim_map
 from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.recording.video import VideoEncoder
+
+if TYPE_CHECKING:
+    from gaussian_swaying.metrics.frechet_video import FrechetVideoDistance
 
 
 def _errors(image: Tensor, target: Tensor) -> dict[str, Tensor]:
@@ -49,6 +53,7 @@ def compare_run(
     points: int = 10_000,
     seed: int = 0,
     device: str | torch.device = "cpu",
+    fvd: FrechetVideoDistance | None = None,
     video: str | os.PathLike[str] | None = None,
     progress: bool = False,
 ) -> dict[str, Any]:
@@ -73,6 +78,7 @@ def compare_run(
         points: Number of points on the reference's surface, and largest number of particles.
         seed: Seed of the points.
         device: Device on which the metrics are computed.
+        fvd: Computes the Fréchet video distance; None for none. It is reset first.
         video: An .mp4 of reference, run and error side by side; None for none.
         progress: Show a progress bar.
 
@@ -80,7 +86,7 @@ def compare_run(
         The content of ``eval.json``: ``mean`` and ``worst`` over the frames and ``per_frame``, with ``psnr_db``,
         ``ssim``, ``mse``, ``chamfer_m`` and its two terms ``run_to_reference_m`` and ``reference_to_run_m``;
         ``psnr_of_mean_db``, the PSNR of the mean square over all frames; ``chamfer_share``, the mean Chamfer distance
-        over ``side_m``; ``skipped``, what was not compared and why; sizes, numbers, seed,
+        over ``side_m``; ``fvd`` with its protocol; ``skipped``, what was not compared and why; sizes, numbers, seed,
         device and versions. What is not finite is None.
 
     Raises:
@@ -118,6 +124,16 @@ def compare_run(
     count = _common_count(run, reference, counts, first, first_reference, frames)
     run_pictures, pictures = run_pictures[first:][:count], pictures[first_reference:][:count]
     size = _common_size(run, reference, run_pictures, pictures) if with_pictures else None
+    if fvd is not None:
+        if not with_pictures:
+            raise ValueError(f"The Fréchet video distance needs pictures ({skipped[0]}): remove its network.")
+        if count < fvd.clip_length + fvd.stride:
+            raise ValueError(
+                f"Two clips of {fvd.clip_length} frames need {fvd.clip_length + fvd.stride} frames, but {count} are "
+                "compared: lower `clip_length`, or remove the network."
+            )
+        fvd.to(device)
+        fvd.reset()
     surface = None if cloth is None else _Surface(run, summary, cloth, first_reference, points, seed, device)
 
     encoder = None
@@ -125,28 +141,37 @@ def compare_run(
         encoder = VideoEncoder(Path(video), 1 / float(summary.get("frame_dt_s") or 0.04))
 
     @torch.inference_mode()
-    def compared(number: int) -> tuple[dict[str, Any], np.ndarray | None]:
-        """The numbers of a frame, and its picture for the video."""
+    def compared(number: int) -> tuple[dict[str, Any], np.ndarray | None, list[Tensor]]:
+        """The numbers of a frame, its picture for the video, and what the network gets: reference and run."""
         row: dict[str, Any] = {"frame": first + number, "reference_frame": first_reference + number}
-        film = None
+        film, small = None, []
         if with_pictures:
             image, target = (_read_frame(files[number], device) for files in (run_pictures, pictures))
             row |= _errors(image, target)
             if encoder is not None:
                 labels = (f"reference, frame {row['reference_frame']}", f"run, frame {row['frame']}")
                 film = comparison_picture(target, image, labels)
+            if fvd is not None:
+                small = [fvd.prepare(rearrange(picture, "h w c -> c h w")) for picture in (target, image)]
         if surface is not None:
             row |= surface.distances(first + number, first_reference + number)
-        return row, film
+        return row, film, small
 
     rows: list[dict[str, Any]] = []
+    prepared: list[list[Tensor]] = []
     try:
         # reading and writing pictures takes longer than comparing them
         done = in_threads(compared, range(count), threads=min(8, os.cpu_count() or 1))
-        for row, film in tqdm(done, total=count, unit="frame", disable=not progress, file=sys.stderr):
+        for row, film, small in tqdm(done, total=count, unit="frame", disable=not progress, file=sys.stderr):
             if encoder is not None and film is not None:
                 encoder.write(film)
+            prepared += [small] if small else []
             rows.append(row)
+        video_distance: dict[str, Any] | None = None
+        if fvd is not None:
+            for real, pile in zip((True, False), zip(*prepared, strict=True), strict=True):
+                fvd.update(torch.stack(pile), real=real)
+            video_distance = {"fvd": float(fvd.compute()), **fvd.protocol()}
         if encoder is not None:
             encoder.finish()
     finally:
@@ -168,6 +193,7 @@ def compare_run(
         "size": None if size is None else list(size),
         "mean": mean,
         "worst": worst,
+        "fvd": video_distance,
         "skipped": skipped,
         "seed": seed,
         "device": describe_device(device),

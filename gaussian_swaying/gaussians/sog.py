@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from gaussian_swaying._inputs import check_regular, check_unpacked, parse_json, read_json
-from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.cloud import GaussianCloud, joined
 from gaussian_swaying.gaussians.packed import (
     check_count,
     floats,
@@ -37,11 +37,14 @@ _MOST_MEANS = 1024  # within one of 256 groups of sets, as time grows with them
 _SAMPLE = 1 << 20  # values of which a code book is made
 
 
-def read_sog(path: str | os.PathLike[str]) -> GaussianCloud:
-    """Read SOG: a bundle (.sog), or the meta.json of a folder.
+def read_sog(path: str | os.PathLike[str], level: int = 0) -> GaussianCloud:
+    """Read SOG: a bundle (.sog), the meta.json of a folder, or the lod-meta.json of a streamed scene.
 
     Centres have 16 bits on a logarithmic scale; sizes, colours and harmonics are entries of code books of 256 numbers;
     opacities and rotations have 8 bits.
+
+    Args:
+        level: Level of detail of a streamed scene that is read; 0 is the finest.
 
     Returns:
         The Gaussians as float32 tensors on the CPU, without normals, in the axes of the file.
@@ -49,7 +52,10 @@ def read_sog(path: str | os.PathLike[str]) -> GaussianCloud:
     path = check_regular(path, "the SOG file")
     with usable(path, "SOG file"):
         if path.suffix.lower() == ".json":
-            return _decoded(path, read_json(path, "SOG file"), functools.partial(_beside, path))
+            meta = read_json(path, "SOG file")
+            if "lodLevels" in meta:
+                return _streamed(path, meta, level)
+            return _decoded(path, meta, lambda name: check_regular(_beside(path, name), "the picture").read_bytes())
         with zipfile.ZipFile(path) as archive:
             held = archive.infolist()
             if any(entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for entry in held):
@@ -125,16 +131,46 @@ def encode_sog(cloud: GaussianCloud) -> bytes:
 # ---- Gaussians from pictures
 
 
-def _beside(path: Path, name: str) -> bytes:
+def _beside(path: Path, name: str) -> Path:
     steps = PurePosixPath(name).parts
     if not steps or ".." in steps or name.startswith("/") or "\\" in name or ":" in name:
         raise ValueError(f"{path} names the file {name[:80]!r}; put all files into its folder.")
-    return check_regular(path.parent.joinpath(*steps), "the picture").read_bytes()
+    return path.parent.joinpath(*steps)
+
+
+def _streamed(path: Path, meta: dict[str, Any], level: int) -> GaussianCloud:
+    if not 0 <= level < meta["lodLevels"]:
+        raise ValueError(f"{path} has the levels 0 to {meta['lodLevels'] - 1}, but level {level} was asked for.")
+    if meta.get("environment"):
+        warnings.warn(f"{path}: left out its environment, {meta['environment']!r}.", UserWarning, stacklevel=4)
+    ranges: dict[Path, list[tuple[int, int]]] = {}
+    nodes, parts = [meta["tree"]], list[GaussianCloud]()
+    while nodes:
+        node = nodes.pop()
+        nodes += node.get("children", [])
+        if str(level) in node.get("lods", {}):
+            wanted = node["lods"][str(level)]
+            file = _beside(path, meta["filenames"][wanted["file"]])
+            ranges.setdefault(file, []).append((wanted["offset"], wanted["count"]))
+    for file, places in sorted(ranges.items()):
+        if file.name == path.name:
+            raise ValueError(f"it names {file.name} as a part of itself")
+        cloud, last = read_sog(file), 0
+        for first, count in sorted(places):
+            if first < last or count < 0 or first + count > len(cloud):
+                raise ValueError(
+                    f"its `tree` wants Gaussians {first} to {first + count - 1} of {len(cloud)} in {file.name}"
+                )
+            parts.append(cloud if count == len(cloud) else cloud.select(torch.arange(first, first + count)))
+            last = first + count
+    if not sum(map(len, parts)):
+        raise ValueError(f"{path} holds zero Gaussians at level {level}; export the scene again.")
+    return joined(*parts)
 
 
 def _decoded(path: Path, meta: dict[str, Any], read: Callable[[str], bytes]) -> GaussianCloud:
     if meta.get("version") != 2:
-        raise ValueError(f"{path} is not SOG of version 2, or a streamed scene; convert it with splat-transform.")
+        raise ValueError(f"{path} is not SOG of version 2; convert it with splat-transform.")
     count, read = meta["count"], functools.cache(read)
     if type(count) is not int or count < 1:
         raise ValueError(f"`count` is {str(count)[:20]}")

@@ -1,1 +1,1 @@
-"""Distances between a run and a reference: structural similarity and nearest points."""
+"""Distances between a run and a reference: structural similarity, nearest points, Fréchet video distance."""

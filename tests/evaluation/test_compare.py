@@ -5,11 +5,12 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from shared import value_error
+from shared import small_network, value_error
 
 from gaussian_swaying.evaluation.compare import compare_run, evaluate, table
 from gaussian_swaying.evaluation.reference import surface_points
 from gaussian_swaying.geometry.frame import SimFrame
+from gaussian_swaying.metrics.frechet_video import FrechetVideoDistance
 
 HEIGHT, WIDTH = 16, 24
 POINTS = 2000
@@ -24,6 +25,11 @@ def compared(make_run, make_reference):
 
 
 # ---- runs
+
+
+@pytest.fixture
+def network(tmp_path):
+    return FrechetVideoDistance(small_network(tmp_path / "network.pt"), clip_length=2, resize=8)
 
 
 def test_a_run_that_is_the_reference(compared):
@@ -287,3 +293,27 @@ def test_the_points_of_a_surface_are_uniform_by_area():
     torch.testing.assert_close(counts / len(flat), torch.full((4, 2), 1 / 8), rtol=0.06, atol=0)
     with value_error("degenerate"):
         surface_points(torch.zeros(3, 3), torch.tensor([[0, 1, 2]]), 5)
+
+
+def test_fvd_with_its_protocol(make_run, make_reference, network):
+    """That of the two videos given at once; equal ones have none."""
+    run, reference = make_run(change=5), make_reference()
+    found = compare_run(run, reference, points=100, fvd=network)
+    again = FrechetVideoDistance(network.weights, clip_length=2, resize=8)
+    for folder, real in ((reference, True), (run, False)):
+        frames = [torch.from_numpy(iio.imread(path)) for path in sorted((folder / "frames").iterdir())]
+        again.update(torch.stack(frames).permute(0, 3, 1, 2) / 255, real=real)
+    assert found["fvd"]["fvd"] == pytest.approx(float(again.compute()))
+    assert found["fvd"]["fvd"] > 1e-3
+    assert found["fvd"]["weights_sha256"] == network.sha256
+    assert network.sha256 in table(found)
+    # what it saw before is forgotten
+    assert compare_run(run, reference, points=100, fvd=network)["fvd"] == found["fvd"]
+
+
+def test_fvd_without_what_it_needs(make_run, make_reference, network):
+    run = make_run()
+    with value_error("needs pictures"):
+        compare_run(run, make_reference(pictures=False), fvd=network)
+    with value_error("Two clips of 2 frames need 3 frames, but 2 are compared"):
+        compare_run(run, make_reference("other"), frames=2, fvd=network)

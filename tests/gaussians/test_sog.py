@@ -84,9 +84,75 @@ def test_a_folder_is_what_a_bundle_holds(tmp_path):
     assert len(Scene(ply=tmp_path / "again.sog").cloud()) == 16
 
 
-def test_a_streamed_scene_is_refused(tmp_path):
-    (tmp_path / "lod-meta.json").write_text('{"lodLevels": 2, "filenames": ["0_0/meta.json"], "tree": {}}')
-    refused(tmp_path / "lod-meta.json", "a streamed scene; convert it with splat-transform")
+def _streamed(folder, change=lambda meta: None):
+    """A streamed scene: two files for the finest level, of which a part is in no leaf, and one for the next."""
+    whole = varied_cloud(30, degree=1)
+    parts = {
+        "0_0": whole.select(torch.arange(20)),
+        "0_1": whole.select(torch.arange(20, 30)),
+        "1_0": varied_cloud(5, 1),
+    }
+    for name, cloud in parts.items():
+        (folder / name).mkdir(parents=True)
+        export_cloud(folder / name / "a.sog", cloud)
+        _unpacked(folder / name, members(folder / name / "a.sog"))
+
+    def leaf(file, offset, count, **others):
+        return {"lods": {"0": {"file": file, "offset": offset, "count": count}, **others}}
+
+    meta = {
+        "lodLevels": 2,
+        "filenames": ["0_0/meta.json", "0_1/a.sog", "1_0/meta.json"],
+        "tree": {
+            "children": [
+                leaf(0, 0, 12, **{"1": {"file": 2, "offset": 0, "count": 5}}),
+                {"children": [leaf(1, 0, 10), leaf(0, 14, 6)]},
+            ]
+        },
+    }
+    change(meta)
+    (folder / "lod-meta.json").write_text(json.dumps(meta))
+    return folder / "lod-meta.json", parts
+
+
+def test_one_level_of_a_streamed_scene(tmp_path):
+    """The finest, unless told otherwise; ranges of the files in place of whole ones."""
+    path, parts = _streamed(tmp_path)
+    first = read_sog(tmp_path / "0_0" / "meta.json")
+    found = read_gaussians(path)
+    assert len(found) == 28
+    assert torch.equal(found.means[:12], first.means[:12])
+    assert torch.equal(found.means[12:18], first.means[14:])
+    assert torch.equal(found.sh[18:], read_sog(tmp_path / "0_1" / "a.sog").sh)
+    assert len(read_sog(path, level=1)) == len(parts["1_0"]) == 5
+    with value_error("has the levels 0 to 1, but level 2 was asked for"):
+        read_sog(path, level=2)
+    path.write_text(path.read_text().replace("{", '{"environment": "env/meta.json", ', 1))
+    with user_warning("left out its environment, 'env/meta.json'"):
+        assert len(read_gaussians(path)) == 28
+
+
+def _leaf(meta):
+    return meta["tree"]["children"][0]["lods"]["0"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda m: m.pop("tree"), "it has no `tree`"),
+        (lambda m: m["tree"].update(children=[]), "zero Gaussians at level 0"),
+        (lambda m: _leaf(m).update(count=-1), "wants Gaussians 0 to -2 of 20"),
+        (lambda m: _leaf(m).update(count=15), "`tree` wants Gaussians 14 to 19 of 20"),
+        (lambda m: _leaf(m).update(offset=19), "`tree` wants Gaussians 19 to 30 of 20"),
+        (lambda m: m.update(filenames=["../x/meta.json"] * 3), "names the file '../x/meta.json'; put all files"),
+        (lambda m: m.update(filenames=["/meta.json"] * 3), "names the file '/meta.json'"),
+        (lambda m: m.update(filenames=["http://a/b"] * 3), "names the file 'http://a/b'"),
+        (lambda m: m.update(filenames=["C:\\b"] * 3), "names the file"),
+        (lambda m: m.update(filenames=["lod-meta.json"] * 3), "names lod-meta.json as a part of itself"),
+    ],
+)
+def test_bad_streams(change, message, tmp_path):
+    refused(_streamed(tmp_path, change)[0], message)
 
 
 def _picture(width, height, value=0):
