@@ -114,7 +114,8 @@ class SplatSkin(Fixed, nn.Module):
     (Lancaster & Salkauskas 1981), in as many directions as they span: along a line, in a sheet, or in space. The fit is
     linear in what the points do, so that :math:`u = \sum_k \phi_k u_k` and
     :math:`F = I + \sum_k u_k \otimes \nabla \phi_k`, with constant weights. Across a sheet F keeps the thickness, and
-    around a line it turns by the smallest rotation. A motion of the whole by one affine map comes out exactly.
+    around a line it turns by the smallest rotation. A rigid motion of the whole comes out exactly, but for the twist of
+    a line, and in a solid any affine map does.
 
     Args:
         gaussians: The Gaussians at rest. Those of a model keep their gradients; they stay bound to the points that were

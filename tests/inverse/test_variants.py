@@ -67,7 +67,7 @@ def test_variants_of_a_scene_with_parts(formulation, tmp_path):
         # the substeps differ; `updated` loses a little motion in each, with a board that is soft as well
         limit = 1e-2 if formulation == "total" else 6e-2
         assert longest(state.position - alone.position) < limit * moved
-    with value_error(r"`material\.density` is to change, but .* `scene\.parts` gives it too"):
+    with value_error(r"`material\.density` is to change, but .* `scene\.parts` or `scene\.materials` gives it too"):
         list(states_of(made(1e4), [{"material.density": 30.0}], TIMES))
 
 

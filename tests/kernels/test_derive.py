@@ -179,7 +179,7 @@ def length(x):
 
 def test_what_cannot_be_traced_is_refused_with_its_line():
     x = torch.ones(3)
-    line = branching.fn.__code__.co_firstlineno + 3
+    line = branching.fn.__code__.co_firstlineno + 2
     with pytest.raises(TraceError, match=rf"branching, line {line}: a condition must be constant"):
         on_tensors(branching)(x, x)
     with pytest.raises(TraceError, match=r"loading, line \d+: `tl.load` cannot be traced"):

@@ -171,7 +171,7 @@ def test_the_examples_of_the_page_run(tmp_path, monkeypatch):
 
 def test_a_number_that_parts_give_is_not_changed_for_all():
     simulation = flag()
-    with value_error(r"`material\.regions` or `scene\.parts` gives it too"):
+    with value_error(r"`material\.regions`, `scene\.parts` or `scene\.materials` gives it too"):
         simulation.change("material.E", 1e5)
     simulation.change("material.nu", 0.2)
     assert simulation.material.nu == 0.2
