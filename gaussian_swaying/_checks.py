@@ -145,13 +145,12 @@ def check_finite(name: str, tensor: Tensor) -> None:
         raise ValueError(f"Expected `{name}` to be finite, but {count} of its values are NaN or infinite.")
 
 
-def check_like(name: str, tensor: Tensor, like: Tensor) -> None:
-    """Check that a tensor has the precision and lies on the device of the material."""
+def check_like(name: str, tensor: Tensor, like: Tensor, others: str = "the material is") -> None:
+    """Check that a tensor has the precision and lies on the device of another one, which is named in the message."""
     if tensor.dtype != like.dtype:
         found, wanted = (str(dtype).removeprefix("torch.") for dtype in (tensor.dtype, like.dtype))
-        raise TypeError(f"Expected `{name}` in {wanted}, as the material is, but got {found}: convert it with `.to`.")
+        raise TypeError(f"Expected `{name}` in {wanted}, as {others}, but got {found}: convert it with `.to`.")
     if tensor.device != like.device:
         raise ValueError(
-            f"Expected `{name}` on {like.device}, where the material is, but it is on {tensor.device}: move it with "
-            "`.to`."
+            f"Expected `{name}` on {like.device}, where {others}, but it is on {tensor.device}: move it with `.to`."
         )

@@ -151,13 +151,16 @@ def export_run(options: argparse.Namespace, format: Format, place: dict[str, Any
     inside = torch.ones(len(scene.model), dtype=torch.bool)
     if options.box is not None:
         inside = Box(options.box[:3], options.box[3:]).contains(scene.model.means)
-    if not bool(inside.any()) or (options.box is not None and options.apart):
-        raise ValueError("--box holds no Gaussian of the run, or is given with --apart: enlarge it, or leave it out.")
+    if not bool(inside.any()):
+        raise ValueError("--box holds no Gaussian of the run: enlarge it, or leave it out.")
+    if options.apart and (options.box is not None or options.bones is not None):
+        raise ValueError("--apart cannot be combined with --box or --bones: leave it out.")
     motion = islice(run.frames(), 0, None, every)
     if options.bones is not None:
         return export_bones(options, target, motion, scene, inside, fps / every, place)
     apart = options.apart and not format.film and not scene.all_move
-    frames = (moved.part_to_cloud(True) if apart else moved.to_cloud().select(inside) for moved in motion)
+    frames = (moved.part_to_cloud(True) if apart else moved.to_cloud() for moved in motion)
+    frames = frames if options.box is None else (cloud.select(inside) for cloud in frames)
     files = export_frames(target, frames, fps / every, **place)
     if apart:
         still = target.with_name(numbered(target.name, "still"))
@@ -180,10 +183,8 @@ def export_bones(
     places = torch.stack([moved.means[moving] for moved in motion])
     bones = fit_bones(rest, places, options.bones)
     error = bones.error(rest, places.double())
-    index, weight = (
-        torch.zeros(len(inside), INFLUENCES, dtype=torch.long),
-        torch.zeros(len(inside), INFLUENCES).double(),
-    )
+    weight = torch.zeros(len(inside), INFLUENCES, dtype=torch.float64)
+    index = torch.zeros_like(weight, dtype=torch.long)
     weight[:, 0] = 1.0  # what does not move follows the bone that stays
     index[moving], weight[moving] = bones.index, bones.weight
     bones = replace(bones, index=index[inside], weight=weight[inside])

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
 
+from gaussian_swaying.geometry.linalg import svd3
 from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_quat
 
 INFLUENCES = 4
@@ -102,9 +103,8 @@ def _rigid(X: Tensor, x: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
 
 def _nearest(moment: Tensor) -> Tensor:
     """The rotations that fit moments (..., 3, 3) best (Kabsch 1976)."""
-    left, _, right = torch.linalg.svd(moment)
-    sign = torch.linalg.det(left @ right)[..., None, None]
-    return torch.cat([left[..., :2], left[..., 2:] * sign], -1) @ right
+    left, _, axes = svd3(moment)
+    return left @ axes.mT
 
 
 def _alone(X: Tensor, bones: tuple[Tensor, Tensor]) -> Tensor:

@@ -15,9 +15,10 @@ from gaussian_swaying._checks import check_positive
 from gaussian_swaying._fixed import Fixed
 from gaussian_swaying._inputs import read_arrays
 from gaussian_swaying.gaussians.cloud import GaussianCloud
+from gaussian_swaying.gaussians.parts import NUMBERS
+from gaussian_swaying.geometry.groups import joined
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
-_NAMES = ("E", "nu", "density", "thickness", "damping_ratio")
 _OF_VOMP = {"youngs_modulus": "E", "poissons_ratio": "nu", "density": "density"}
 _APART = 3.0  # spacings of places between two rigid bodies
 
@@ -50,7 +51,7 @@ class MaterialField:
     def __post_init__(self) -> None:
         if not len(self.places) or not bool(torch.isfinite(self.places).all()):
             raise ValueError("Expected `scene.materials` to have one finite place or more: leave out the others.")
-        for name in _NAMES:
+        for name in NUMBERS:
             values = getattr(self, name)
             if values is None:
                 continue
@@ -71,14 +72,13 @@ class MaterialField:
     def at(self, points: Tensor) -> dict[str, Tensor]:
         """The numbers at points (N, 3) in scene units, by name, float64, shape (N,)."""
         near = nearest_neighbours(self.places, 1, points)[1][:, 0]
-        known = {name: getattr(self, name) for name in _NAMES}
+        known = {name: getattr(self, name) for name in NUMBERS}
         return {name: values.double()[near].to(points.device) for name, values in known.items() if values is not None}
 
     def rigid_bodies(self, means: Tensor) -> list[Tensor]:
         """Which of some Gaussians (N, 3) each rigid body holds: masks (N,); bodies lie apart from each other."""
         if self.rigid is None or not bool(self.rigid.any()):
             return []
-        from scipy.sparse.csgraph import connected_components
         from scipy.spatial import cKDTree
 
         mask = self.rigid[nearest_neighbours(self.places, 1, means)[1][:, 0]]
@@ -86,8 +86,8 @@ class MaterialField:
         if len(inside) < 2:
             return [mask] if len(inside) else []
         spacing = float(nearest_neighbours(inside, 1)[0].median())
-        near = cKDTree(inside.numpy()).sparse_distance_matrix(cKDTree(inside.numpy()), _APART * max(spacing, 1e-12))
-        number = torch.from_numpy(connected_components(near.tocsr() + near.tocsr().T, directed=False)[1])
+        pairs = cKDTree(inside.numpy()).query_pairs(_APART * max(spacing, 1e-12), output_type="ndarray")
+        number = joined(len(inside), torch.from_numpy(pairs.T))
         index = mask.nonzero()[:, 0]
         return [torch.zeros_like(mask).index_fill(0, index[number == k], True) for k in range(int(number.max()) + 1)]
 
@@ -126,7 +126,7 @@ class MaterialFile(MaterialSource):
 
     def __call__(self, cloud: GaussianCloud) -> MaterialField:
         """See :class:`MaterialSource`."""
-        found = read_arrays(self.path, "the materials", (), ("places", "voxel_data", *_NAMES))
+        found = read_arrays(self.path, "the materials", (), ("places", "voxel_data", *NUMBERS))
         whole = found.pop("voxel_data", None)
         if whole is not None:
             missing = {"x", "y", "z", *_OF_VOMP} - set(whole.dtype.names or ())
@@ -140,7 +140,7 @@ class MaterialFile(MaterialSource):
             raise ValueError(f"{self.path} holds what is not numbers ({error}): make the materials again.") from error
         places = arrays.pop("places", None)
         if not arrays:
-            raise ValueError(f"{self.path} has none of the arrays {', '.join(_NAMES)}: give one of them.")
+            raise ValueError(f"{self.path} has none of the arrays {', '.join(NUMBERS)}: give one of them.")
         if places is None:
             places, count = cloud.means.detach().cpu().double(), len(next(iter(arrays.values())).reshape(-1))
             if count != len(places):

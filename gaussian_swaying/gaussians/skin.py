@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from gaussian_swaying._checks import check_shape
+from gaussian_swaying._checks import check_like, check_shape
 from gaussian_swaying._devices import in_double
 from gaussian_swaying._fixed import Fixed
 from gaussian_swaying.gaussians.cloud import GaussianCloud
@@ -252,8 +252,10 @@ class SplatSkin(Fixed, nn.Module):
 
     def _check(self, points: Tensor, deformation_gradient: Tensor | None) -> None:
         check_shape("points", points, len(self.rest), 3)
+        check_like("points", points, self.rest, "the Gaussians are")
         if deformation_gradient is not None:
             check_shape("deformation_gradient", deformation_gradient, len(self.rest), 3, 3)
+            check_like("deformation_gradient", deformation_gradient, self.rest, "the Gaussians are")
 
 
 def _together(rows: Tensor) -> Tensor:
@@ -296,10 +298,14 @@ def _bound(
     That is the arm from where the fit is read (N, 3), the axis of :func:`completed` (N, 3), and the number of
     directions that the neighbours span (N,).
     """
-    nearest, first = (found[:, 0] for found in nearest_neighbours(points, 1, places))
-    read = torch.where((nearest > _FAR * spacing[first])[:, None], points[first], places)
     count = min(NEIGHBOURS, len(points))
-    distance, index = nearest_neighbours(points, min(count if reach is None else 3 * count, len(points)), read)
+    candidates = min(count if reach is None else 3 * count, len(points))
+    distance, index = nearest_neighbours(points, candidates, places)
+    first = index[:, 0].clone()
+    far = distance[:, 0] > _FAR * spacing[first]
+    read = torch.where(far[:, None], points[first], places)
+    if bool(far.any()):
+        distance[far], index[far] = nearest_neighbours(points, candidates, read[far])
     allowed = torch.ones_like(index, dtype=torch.bool)
     if reach is not None:
         pair = first[:, None] * len(points) + index

@@ -66,7 +66,7 @@ from gaussian_swaying.wind.patches import Patches, joined_directions, second_mom
 
 if TYPE_CHECKING:
     PartsLike = str | os.PathLike[str] | Parts
-    MaterialsLike = MaterialSource | str | os.PathLike[str]
+    MaterialsLike = MaterialSource | str | os.PathLike[str]  # a parser takes the first that fits
 else:  # what a YAML file can contain
     PartsLike = str | os.PathLike[str]
     MaterialsLike = MaterialSource | str
@@ -1071,10 +1071,9 @@ def _points_of(samples: Samples, group: Tensor, parts: Tensor, side: float) -> t
     normal = torch.where(solid[:, None], 0.0, torch.where(alone[:, None], found.normal, axis))
     areas = {name: sums(getattr(samples, name), owner, count) for name in ("body_area", "area")}
     volume = sums(samples.volume, group)[of] / share
-    for name in _NUMBERS:
+    for name in () if samples.kind is None else _NUMBERS:  # a field of materials, of which the points take the mean
         values = getattr(samples, name)
-        if bool((values != values[first][group]).any()):  # a field of materials
-            areas[name] = (sums(samples.volume * values, group) / sums(samples.volume, group))[of]
+        areas[name] = (sums(samples.volume * values, group) / sums(samples.volume, group))[of]
     return replace(found, position=position, normal=normal, volume=volume, **areas), owner, of
 
 

@@ -230,10 +230,10 @@ def _of_toa5(path: Path, rows: list[list[str]]) -> list[list[str]]:
     units = ["s" if rows[2][place] == "TS" else rows[2][place] for place in wanted]
     found = [[f"{known[rows[1][place]]} [{unit}]" for place, unit in zip(wanted, units, strict=True)]]
     start: Any = None
+    at = next((at for at, place in enumerate(wanted) if rows[1][place] == "TIMESTAMP"), None)
     for line, row in enumerate(rows[4:], start=5):
         cells = [row[place] if place < len(row) else "" for place in wanted]
-        if "TIMESTAMP" in rows[1]:
-            at = wanted.index(rows[1].index("TIMESTAMP"))
+        if at is not None:
             try:
                 now = np.datetime64(cells[at])
             except ValueError as error:

@@ -104,6 +104,8 @@ def test_a_part_of_a_run_at_another_rate_and_as_a_skin(run, tmp_path, capsys):
         (["f_#.ply", "--box", "5", "5", "5", "6", "6", "6"], "holds no Gaussian"),
         (["f_#.ply", "--bones", "6"], "--bones is not for the frames of a run as .ply"),
         (["f.glb", "--bones", "1"], "from 2 to 256"),
+        (["f.glb", "--bones", "6", "--apart"], "--apart cannot be combined"),
+        (["f_#.ply", "--box", "0", "-1", "0", "1", "1", "1", "--apart"], "--apart cannot be combined"),
     ],
 )
 def test_what_of_a_run_cannot_be_written(run, options, message, tmp_path, capsys):

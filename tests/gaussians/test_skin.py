@@ -212,3 +212,5 @@ def test_bad_points_are_refused():
         skin(points[:8])
     with pytest.raises(ValueError, match="deformation_gradient"):
         skin(points, torch.eye(3).repeat(8, 1, 1))
+    with pytest.raises(TypeError, match="`points` in float64, as the Gaussians are, but got float32"):
+        skin(points.float())
