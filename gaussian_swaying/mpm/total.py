@@ -573,6 +573,7 @@ class TotalRun(Run):
 
     def _take_values(self, values: Tensor) -> None:
         if len(self.values) < values.shape[1]:
+            self.repeater.forget()  # recordings read the old one
             self.values = torch.zeros(values.shape[1], self.count, **self.like)
         self.values[: values.shape[1]].copy_(values[self.order.long()].T)
 

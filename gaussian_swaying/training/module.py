@@ -291,7 +291,10 @@ class SplatTrainer(lightning.LightningModule):
         return loss.detach()
 
     def _seed(self, step: int, rank: int) -> None:
-        torch.manual_seed(((self.seed * 1_000_003 + step) * 1_009 + rank) % 2**63)
+        seed = ((self.seed * 1_000_003 + step) * 1_009 + rank) % 2**63
+        torch.default_generator.manual_seed(seed)  # torch.manual_seed also queues a call with its stack, for good, for
+        if self.device.type == "cuda":  # each kind of device that this process does not use
+            torch.cuda.manual_seed(seed)
 
     def _surface(self, output: SplatOutput, camera: Camera) -> tuple[Camera, SurfaceMaps]:
         assert output.channels is not None

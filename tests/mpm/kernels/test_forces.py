@@ -10,6 +10,7 @@ from gaussian_swaying.mpm import run as substeps
 from gaussian_swaying.mpm import updated
 from gaussian_swaying.mpm.colliders import Wall
 from gaussian_swaying.mpm.device_functions import DeviceFunction, Numbers
+from gaussian_swaying.mpm.pull import pull
 
 from .bodies import (
     DT,
@@ -219,6 +220,33 @@ def test_a_twin_from_outside(kernel_device, formulation, resists):
         return states
 
     check_agreement(run_both(points, run, formulation))
+
+
+class _Held(Force):
+    """A pull towards the place of the points at rest, as a user's mouse: more numbers of each point, but no other."""
+
+    def __init__(self, points):
+        super().__init__()
+        self.register_buffer("points", torch.cat([points.position, 0.1 * points.mass[..., None]], dim=-1))
+
+    def device_function(self):
+        return pull(lambda: self.points, lambda time, dt, steps: time.float().expand(steps, 3), sources=(self.points,))
+
+
+@in_both
+def test_no_recording_reads_the_numbers_of_points_of_before_a_force_with_more(kernel_device, formulation):
+    points = make_points(kernel_device, count=60)
+    load, held = make_load(points), _Held(points)
+    solver = make_solver("kernels", formulation)
+    start = set_going(solver, points)
+    for _ in range(3):
+        solver.rollout(start, DT, 22, load)
+    solver.rollout(start, DT, 22, [load, held])
+    load.area.mul_(2.0)
+    found = solver.rollout(start, DT, 22, load)
+    fresh = make_solver("kernels", formulation)
+    set_going(fresh, points)
+    check_agreement([fresh.rollout(start, DT, 22, load), found])
 
 
 @pytest.mark.gpu
