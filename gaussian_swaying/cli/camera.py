@@ -55,7 +55,7 @@ def write_camera(options: argparse.Namespace) -> int:
     from gaussian_swaying.gaussians.formats import read_gaussians
     from gaussian_swaying.inverse import registration
     from gaussian_swaying.inverse.film import open_film
-    from gaussian_swaying.inverse.pictures import side_by_side, titled
+    from gaussian_swaying.inverse.report import side_by_side, titled
 
     if options.fov is not None and not 0 < options.fov < 180:
         raise ValueError(f"Expected `--fov` to be between 0 and 180 degrees, but got {options.fov:g}.")

@@ -67,14 +67,13 @@ def explain(error: BaseException) -> str:
 
 def sweep(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     """Do the runs that are missing, and report."""
-    from gaussian_swaying.sweeps.dataset import SHARDS, write_shards
+    from gaussian_swaying.sweeps.dataset import PARQUET, SHARDS, TABLE, write_shards
     from gaussian_swaying.sweeps.plan import make_plan, read_sweep
-    from gaussian_swaying.sweeps.record import PARQUET, TABLE
     from gaussian_swaying.sweeps.run import check_extra, run_sweep
 
     if options.shards is not None:
         check_whole("shards", options.shards, 1)
-        check_extra("shards", "webdataset", "webdataset")
+        check_extra("shards", "webdataset")
     file = Path(with_shipped(["--config", options.sweep], "sweep")[1])
     parser = Simulation.parser()
     with guessing(parser):

@@ -19,18 +19,10 @@ from gaussian_swaying.rendering.cameras.camera import Camera, project
 from gaussian_swaying.simulation.measure import SimulationDiverged
 from gaussian_swaying.simulation.simulation import Simulation
 
-LEAST_FACING = 0.05
-"""Least weight of the residuals of a point that is seen edge-on."""
-
-MOMENTS, PATCHES = 4, 4
-"""Parts of the time, and squares along each side of the grid over tracks, which sort residuals into clusters of
-correlated errors."""
-
-NOISE = 0.5
-"""Distance of a track that its own error explains [pixels]."""
-
-HELD, LEAST_HELD = 7, 6
-"""One of so many tracks is not fitted, if there are at least so many of them."""
+LEAST_FACING = 0.05  # least weight of the residuals of a point that is seen edge-on
+MOMENTS, PATCHES = 4, 4  # parts of the time, and squares along each side of the object: clusters
+NOISE = 0.5  # distance of a track that its own error explains [pixels]
+HELD, LEAST_HELD = 7, 6  # one of so many tracks is not fitted, if there are at least so many of them
 
 
 class Evidence:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -24,53 +25,24 @@ from gaussian_swaying.inverse.videos import Footage, check_wide, frames_of, next
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.protocol import RenderOutput
 
-SIDE, SMALL = 960, 240
-"""Longer side of the frames that are used, at most, and of those in which motion is looked for [pixels]."""
-
-DIFFERENT, MOVED_SHARE = 8.0, 0.02
-"""Grey levels by which a pixel differs that has moved, and the share of such pixels in a frame that has."""
-
-DIAGONAL = math.hypot(36, 24)
-"""Of the film to which a focal length in mm is equivalent [mm]."""
-
-FULL = 0.6
-"""Share of the picture that a splat covers which has surroundings: then most of its points stand still."""
-
-STRAY, IN_A_ROW = 1.5, 3
-"""Distance of a point that moves from where it was at rest [pixels], and frames in which some do, where most of the
-picture stands still."""
-
-LEAST_SHAKEN = 8
-"""Fewest points that tell how a hand shakes."""
-
-END, FLAT, FEWEST = 0.12, 0.3, 5
-"""Part of an object that is one of its ends, as a share of its length in that direction; least length in a direction
-that has ends, per the largest one; and fewest points that make an end."""
-
-STILL, LEAST_MOTION = 0.35, 3.0
-"""Largest motion of a held end, per that of the liveliest quarter of the points, and the least of these [pixels]."""
-
-LIVELY, MOST = 0.25, 0.5
-"""Motion of what moves, per that of the liveliest fiftieth of the points (the rest is drift of the tracks), and largest
-share of the points that move if there are things around that do not."""
-
-CELLS, PAD = 24, 0.02
-"""Cells along what moves, within two of which things are connected; and what its box is larger, as shares of it."""
-
+SIDE, SMALL = 960, 240  # longer sides of frames at most, and of those that show when it begins to move [pixels]
+DIFFERENT, MOVED_SHARE = 8.0, 0.02  # grey levels by which a pixel has moved, and share of those in a frame
+DIAGONAL = math.hypot(36, 24)  # of the film to which a focal length in mm is equivalent [mm]
+FULL = 0.6  # share of the picture that a splat covers which has surroundings: then most of its points stand still
+STRAY, IN_A_ROW = 1.5, 3  # motion of a point where most of the picture is still [pixels], and frames in which some do
+LEAST_SHAKEN = 8  # fewest points that tell how a hand shakes
+END, FLAT, FEWEST = 0.12, 0.3, 5  # length of an end per the whole; of a direction per the longest; points of an end
+STILL, LEAST_MOTION = 0.35, 3.0  # motion of a held end per that of the liveliest quarter; least of that [pixels]
+LIVELY, MOST = 0.25, 0.5  # motion per that of the liveliest fiftieth, and largest share of the points that move
+CELLS, PAD = 24, 0.02  # cells along what moves, within two of which things are connected; margin of its box
 _FOCAL = re.compile(r"focal.?length\S*35mm\S*\s*:\s*([0-9.]+)", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
 class Film:
-    """A film that is read in reduced size.
+    """A film whose frames are read in another size, by which it is ``full`` times as large.
 
-    Attributes:
-        width: Of the frames as they are read [pixels].
-        height: Of them.
-        full: Factor by which the film itself is larger.
-        fps: Frames per second.
-        seconds: Its length [s], as the file says; infinite if it says none, as films that browsers record.
-        focal: Focal length that the file says, equivalent to one on 35 mm film [mm]; None if it says none.
+    ``seconds`` is infinite, and ``focal`` (on 35 mm film [mm]) None, if the file does not say it.
     """
 
     path: Path
@@ -89,7 +61,7 @@ class Film:
 
 
 def open_film(path: str | Path, side: float | None = None) -> Film:
-    """Read the head of a film; ``side`` is the longer side of its frames at most [pixels], :data:`SIDE` if left out."""
+    """Read the head of a film whose frames are to have at most this longer side [pixels]."""
     file = check_regular(Path(path), "the film")
     with closing(frames_of(file)) as frames:
         head = next_of(frames, file)
@@ -104,7 +76,6 @@ def open_film(path: str | Path, side: float | None = None) -> Film:
 
 
 def _focal(path: Path) -> float | None:
-    """The focal length among the tags of a film, as phones write it [mm on 35 mm film]."""
     from imageio_ffmpeg import get_ffmpeg_exe
 
     words = [get_ffmpeg_exe(), "-hide_banner", "-i", str(path)]
@@ -127,16 +98,11 @@ def view_of_focal(millimetres: float, width: int, height: int) -> float:
 class Points:
     """Points of a splat in the grey first frame of a film, at rest, and points around it, which tell how a hand shakes.
 
-    The splat is drawn from the camera of the first frame, perhaps larger.
-
-    Attributes:
-        start: All of them, of the splat first [pixels], shape (T, 2).
-        full: Whether the splat covers most of the picture. Then most of its points stand still, and tell it.
+    The splat is drawn from the camera of the first frame, perhaps larger. If it is ``full``, it covers most of the
+    picture, and most of its points stand still.
     """
 
     def __init__(self, grey: Any, picture: RenderOutput, camera: Camera) -> None:
-        import numpy as np
-
         cv2, scale = opencv(), camera.width / grey.shape[1]
         alpha = picture.alpha[..., 0].detach().cpu().numpy()
         cover = (cv2.resize(alpha, grey.shape[::-1], interpolation=cv2.INTER_AREA) > SOLID).astype(np.uint8)
@@ -148,12 +114,7 @@ class Points:
         self._lens = camera.intrinsics.double().numpy() / np.array([[scale], [scale], [1.0]])
 
     def far(self, place: Any, seen: Any, near: float) -> Any:
-        """How far points of the splat that are found in a frame, of all (T, 2), have gone [pixels]; NaN if not known.
-
-        Where most of the picture stands still, points agree on a camera that are nearer than ``near``.
-        """
-        import numpy as np
-
+        """How far points of the splat, of all (T, 2), have gone [pixels]; NaN if not known."""
         found, used = np.full(self._count, np.nan), seen[: self._count] & self.known
         there = place[: self._count][used]
         if self.full:
@@ -165,9 +126,6 @@ class Points:
         return found
 
     def shake(self, place: Any, seen: Any) -> Any:
-        """The motion of the picture from the first frame to another, as points around the splat tell it, (2, 3)."""
-        import numpy as np
-
         around, turn = seen.copy(), None
         around[: self._count] = False
         if around.sum() >= LEAST_SHAKEN:
@@ -176,12 +134,7 @@ class Points:
 
 
 def begins_to_move(film: Film, picture: RenderOutput, camera: Camera) -> float | None:
-    """Time of the first frame in which the object is not as in the first one, at rest [s]; None if there is none.
-
-    A hand that shakes moves the background, too, and does not count. The splat is drawn from the camera of that frame.
-    """
-    import numpy as np
-
+    """Time of the first frame in which the object, not only the camera, has moved [s]; None if there is none."""
     cv2: Any = opencv()
     factor = max(1.0, max(film.width, film.height) / SMALL)
     size = round(film.width / factor), round(film.height / factor)
@@ -212,7 +165,6 @@ def begins_to_move(film: Film, picture: RenderOutput, camera: Camera) -> float |
 
 
 def _differs(first: Any, grey: Any, where: Any) -> bool:
-    """Return whether some pixels of a frame are not those of the first one, but for its brightness."""
     before, now = (picture[where].astype(float) for picture in (first, grey))
     level = now * (before.mean() / max(now.mean(), 1.0))
     return bool((abs(level - before) > DIFFERENT).mean() > MOVED_SHARE)
@@ -221,8 +173,8 @@ def _differs(first: Any, grey: Any, where: Any) -> bool:
 def held_end(places: Tensor, moved: Tensor, up: Sequence[float]) -> tuple[str, float, float] | None:
     """Find the end of an object that moves least in a film, from how far points (T, 3) of it go, (T,) [pixels].
 
-    Its name, ``top``, ``bottom``, or ``+x`` to ``-z`` of the splat, and how far it and the liveliest quarter of the
-    points go. None if no end is much more still than the rest, as in an object that is held at a corner or within.
+    Its name, and how far it and the liveliest quarter of the points go. None if no end is much more still than the
+    rest.
     """
     if len(moved) < 4 * FEWEST or (others := float(moved.quantile(0.75))) < LEAST_MOTION:
         return None
@@ -266,13 +218,7 @@ def moving_box(places: Tensor, moved: Tensor, cloud: GaussianCloud) -> tuple[Ten
 
 
 def moving_points(video: Footage, picture: RenderOutput) -> tuple[Tensor, Tensor]:
-    """Follow points of a splat through a film that begins at rest, and take the shake of a hand off.
-
-    The places in the splat of those that are seen for half of the film, (T, 3), and how far each goes at most, (T,)
-    [pixels]. The splat is drawn from the camera of the first frame.
-    """
-    import numpy as np
-
+    """Places (T, 3) of a splat that are seen for half of a film, and how far each goes, without the hand [pixels]."""
     cv2, images = opencv(), video.images.numpy()
     points = Points(cv2.cvtColor(images[0], cv2.COLOR_RGB2GRAY), picture, video.cameras[0])
     position, seen = follow(images, points.start)

@@ -42,19 +42,19 @@ from gaussian_swaying.inverse.least_squares import (
     solve,
     step_from,
 )
-from gaussian_swaying.inverse.look import AWAY, first_look
-from gaussian_swaying.inverse.pictures import BEFORE, write_before
 from gaussian_swaying.inverse.plan import Plan, parse_base, read_unknown
+from gaussian_swaying.inverse.registration import AWAY, first_look
 from gaussian_swaying.inverse.report import (
+    BEFORE,
     PICTURES,
     Fit,
     consequences,
     predictions,
     wind_seen,
+    write_before,
     write_page,
     write_results,
 )
-from gaussian_swaying.inverse.rivals import is_mirrored, mirrored_place
 from gaussian_swaying.inverse.tracks import Tracks, beside_rest, match, opencv, still_until, track
 from gaussian_swaying.inverse.unknowns import (
     FILM_START,
@@ -62,6 +62,8 @@ from gaussian_swaying.inverse.unknowns import (
     check_apart,
     check_unknowns,
     directions,
+    is_mirrored,
+    mirrored_place,
     values_at,
 )
 from gaussian_swaying.inverse.variants import check_variants, states_of
@@ -76,53 +78,18 @@ OURS = (PROGRESS, "page.html", "values.csv", "result.json", "scene.yaml", PICTUR
 
 UNSETTLED = "The values have not settled: `iterations` ran out: raise it and continue with --resume."
 
-FOLLOWED = (0.25, 0.5)
-"""Shares of the fitted frames in which points are followed from frame to frame, from each start.
-
-Chaos grows with time: in a flapping flag, a change of Young's modulus by a hundredth makes pixels of difference
-within two seconds, and over the whole video the cost has local minima far from the global one. So the first horizon is
-the shortest time that determines the unknowns, and its solution must be exact before time is added."""
-
-STEPS = (0.5, 0.5, 0.75, 1.0, 1.0)
-"""Then shares in which Gaussians are matched from rendered frames to frames of the video, one after the other."""
-
-STARTS = 3
-"""Starts that the search gives to short solves."""
-
-SEARCHED = 0.5
-"""Share of the fitted frames that the coarse search looks at."""
-
-COARSE = 0.02
-"""Standard deviation of residuals in the coarse search, per the width of a picture."""
-
-LONG_STILL = 0.05
-"""Longest time that a film may be still, if the start of its motion is no unknown [s]."""
-
-SPREAD = ("wind.speed", "wind.azimuth", "material.E")
-"""Unknowns whose starts are spread over their ranges although one was given."""
-
-APART, SAME = 0.15, 0.03
-"""Least distance between starts, and largest between ends that are the same, as a share of a range."""
-
-BRIEF, REFINED, TRIES = 4, 5, 2
-"""Most iterations of a short solve at a horizon, and on another grid; and steps that are tried for each."""
-
-RIVAL, MIRRORED = 1.05, 1.25
-"""Cost per that of the best end below which another end may be right as well, and that of the mirrored wind, which
-differs by so little that errors of the model decide: a wrong one was lower by a tenth."""
-
-DRAG = ("aero.C_D", "aero.C_F")
-"""Coefficients that scale the force of the wind."""
-
-GRIDS = (0.8, 1.25)
-"""Cells of other grids that tell the error of the grid, per its own."""
-
-BEGUN, BEGINS, MOST_STARTS = 12, 10, 60
-"""Simulations that are compared with the first frame of a film in motion, starts of each, and most starts that the
-coarse search tries with each simulation."""
-
-LONG, COARSER = 300.0, 1.3
-"""Expected time of a fit on a CPU above which a coarser grid is proposed [s], and its cells per those of the base."""
+FOLLOWED = (0.25, 0.5)  # shares of the frames in which points are followed; chaos grows with time
+STEPS = (0.5, 0.5, 0.75, 1.0, 1.0)  # then those in which Gaussians are matched from rendered frames
+STARTS, SEARCHED, COARSE = 3, 0.5, 0.02  # starts, share of the frames, and residuals per picture, of the search
+LONG_STILL = 0.05  # longest time that a film may be still, if the start of its motion is no unknown [s]
+SPREAD = ("wind.speed", "wind.azimuth", "material.E")  # searched although a start was given
+APART, SAME = 0.15, 0.03  # least distance of starts, and largest of ends that are the same, as shares of a range
+BRIEF, REFINED, TRIES = 4, 5, 2  # most iterations of a short solve, and on another grid; steps that are tried for each
+RIVAL, MIRRORED = 1.05, 1.25  # cost per the best below which another end is a rival; that of the mirrored wind
+DRAG = ("aero.C_D", "aero.C_F")  # coefficients that scale the force of the wind
+GRIDS = (0.8, 1.25)  # cells of other grids that tell the error of the grid, per its own
+BEGUN, BEGINS, MOST_STARTS = 12, 10, 60  # simulations, starts of each at the first frame, and in the search
+LONG, COARSER = 300.0, 1.3  # time of a fit above which a coarser grid is proposed [s], and its cells
 
 
 class Say:
@@ -149,14 +116,11 @@ class Course:
     """The resume state of a fit, as ``fit.json`` stores it; places are shares of the ranges.
 
     Attributes:
-        step: Number of the step, of :data:`STEPS`; -1 before the end of the search.
-        starts: Places that the search found.
+        step: Number of the step, of :data:`STEPS`; -1 before the end of the search, which found ``starts``.
         first: The place whose simulation the first frame looks like; empty if it shows the scene at rest.
-        rivals: Where other starts ended, to be compared with the end.
+        rivals: Where other starts ended.
         matched: The place at which the current step began, and Gaussians were matched; empty before it.
-        tried: Steps that the solve of the last step has tried.
-        ended: The reason why it ended; empty if it did not.
-        seconds: Time spent.
+        tried: Steps that the solve of the last step has tried, and ``ended`` why it ended; empty if it did not.
     """
 
     step: int = -1
@@ -174,10 +138,7 @@ class Course:
 class Problem:
     """The unknowns of a simulation, and the videos from which they are found.
 
-    Args:
-        grids: The simulation on other grids, which tell what the grid does to the values.
-        judged: What the background said of the videos, see :func:`~gaussian_swaying.inverse.hand.prepared`.
-        looked: Sentences on cameras that are not where they are said to be.
+    ``grids`` are the simulation on other grids, ``judged`` what the background says, ``looked`` sentences on cameras.
     """
 
     def __init__(
@@ -216,10 +177,7 @@ class Problem:
                     "cut all videos to the same beginning, or leave that camera out of `cameras`."
                 )
 
-    # ---- what is compared
-
     def _until(self, share: float) -> list[float]:
-        """Times of a share of the fitted frames."""
         return self.fitted[: max(3, round(share * len(self.fitted)))]
 
     @property
@@ -245,11 +203,7 @@ class Problem:
         return write_before(folder / BEFORE, self.simulation, self.videos, self.tracks)
 
     def begin_from(self, places: Tensor) -> list[float]:
-        """Return which of some places (B, U) the first frame of a film in motion looks like most, with its best start.
-
-        That is the one from whose pictures the most Gaussians are found in the first frames. One simulation of each
-        shows all starts.
-        """
+        """Return the place of some (B, U), with its start, from whose pictures most Gaussians are found at first."""
         known = self.begins
         assert known is not None
         before = torch.linspace(max(0.0, -known.high), -known.low, BEGINS, dtype=torch.float64).tolist()
@@ -305,13 +259,11 @@ class Problem:
         with self.say.work(f"to {times[-1]:.3g} s", most * len(times) * (TRIES + 2 * len(at))):
             return solve(self.residuals(evidence, times), at, TRIES * most, closely)
 
-    # ---- the steps
-
     def search(self) -> list[list[float]]:
         """Return the best starts of a coarse search: Sobol's sequence over the ranges.
 
         Coefficients and damping stay in the middle of their ranges, and what has a ``start`` stays there, but for
-        :data:`SPREAD`. Values that were given are the first start. Simulations of similar stiffness are one batch.
+        :data:`SPREAD`. Values that were given are the first start.
         """
         unknowns, plan = self.plan.unknowns, self.plan
         begin = torch.tensor([self.middle], dtype=torch.float64)
@@ -367,8 +319,7 @@ class Problem:
     ) -> tuple[list[list[float]], list[float]]:
         """Short solves from some places: their ends, apart from each other and the best first, and their costs.
 
-        Without evidence, as of a film in motion, each compares the points that its own first frame has: those that are
-        followed from where one place has them speak for that place.
+        Without evidence each compares the points of its own first frame, as those of one place speak for that place.
         """
         found, more = [], []
         for place in places:
@@ -391,10 +342,7 @@ class Problem:
         return ends, kept
 
     def others(self, place: Sequence[float], rivals: Sequence[Sequence[float]]) -> list[dict[str, float]]:
-        """Values of other ends that cost as little as the best one over all fitted frames, or less.
-
-        Other starts, and the mirrored wind, are tried.
-        """
+        """Values of other ends, of other starts and the mirrored wind, that cost about as little over all frames."""
         model, unknowns = self.simulation.model, self.plan.unknowns
         tried = [*map(list, rivals), *mirrored_place(model, unknowns, place)]
         if not tried:
@@ -430,12 +378,9 @@ class Problem:
         return told
 
     def run(self, course: Course, keep: Callable[[Course], None], films: Path | None = None) -> Fit:
-        """Do the steps that are missing, and return the result.
+        """Do the steps that are missing, call ``keep`` after each, and return the result.
 
-        Args:
-            course: The resume state; a new one for a new fit.
-            keep: Called after every step, to write the course.
-            films: Folder for films beside the fit; None for none.
+        Films beside the fit are written into the folder ``films``.
         """
         clock = time.monotonic() - course.seconds
 
@@ -461,7 +406,6 @@ class Problem:
         return replace(result, seconds=time.monotonic() - clock)
 
     def _stepped(self, course: Course, kept: Callable[[], None]) -> list[Evidence]:
-        """Do the steps from that of the course on, and return the evidence of the last one."""
         for number in range(course.step, len(STEPS)):
             times, last = self._until(STEPS[number]), number == len(STEPS) - 1
             course.matched = course.matched or list(course.place)
@@ -482,7 +426,6 @@ class Problem:
         return evidence
 
     def result(self, course: Course, evidence: Sequence[Evidence], films: Path | None) -> Fit:
-        """The result of a course that has ended, with the evidence of its last step."""
         place, values = torch.tensor(course.place, dtype=torch.float64), self.values(course.place)
         normal = linearised(self.residuals(evidence, self.fitted), place)
         runs = states_of(self.simulation, [values], self.times, alike=False)
@@ -504,10 +447,9 @@ class Problem:
         )
 
     def grid_covariance(self, place: Tensor, evidence: Sequence[Evidence]) -> Tensor:
-        """The covariance that the grid adds at a place, shape (U, U).
+        """The covariance that the grid adds at a place, (U, U): how far the minimum of another grid is.
 
-        The same residuals have their minimum elsewhere on a finer and on a coarser grid. It is found by a solve, as
-        a linear step is often too short; that step counts where none lowers the cost.
+        A linear step, which is often too short, counts where a solve finds none.
         """
         found = torch.zeros(2 * (len(place),), dtype=torch.float64)
         for other in self.grids:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -30,11 +31,19 @@ from gaussian_swaying.inverse.film import (
     view_of_focal,
 )
 from gaussian_swaying.inverse.fit import run_fit
-from gaussian_swaying.inverse.look import FOUND, shown_in
-from gaussian_swaying.inverse.pictures import side_by_side, titled
 from gaussian_swaying.inverse.plan import read_plan
-from gaussian_swaying.inverse.registration import CAMERAS, PICTURE, STILLS, fov_of, in_space, register, transforms
-from gaussian_swaying.inverse.report import Fit
+from gaussian_swaying.inverse.registration import (
+    CAMERAS,
+    FOUND,
+    PICTURE,
+    STILLS,
+    fov_of,
+    in_space,
+    register,
+    shown_in,
+    transforms,
+)
+from gaussian_swaying.inverse.report import Fit, side_by_side, titled
 from gaussian_swaying.inverse.unknowns import FILM_START, SCALE
 from gaussian_swaying.inverse.videos import Footage, read_videos
 from gaussian_swaying.rendering.cameras.camera import Camera
@@ -44,22 +53,13 @@ from gaussian_swaying.suggestion.suggest import suggest
 from gaussian_swaying.suggestion.suggestion import Suggestion
 
 PLAN, LOOK, RESULT = "fit.yaml", "preview", "result"
-SECONDS, LEAD = 1.5, 0.4
-"""Time of motion that is fitted (half as much again is predicted), and longest time at rest that is kept before it
-[s]."""
-SOFTER, STIFFER = 1 / 30, 30.0
-"""Range of E, per that which the preview guesses."""
-SPEED = (0.5, 25.0)
-"""Range of the wind [m/s]."""
-ROUGH = 1.2e-3
-"""Distance of points from where a camera sees them with which it may be wrong, as a share of the picture's diagonal."""
-UPRIGHT, NEARLY = 0.5, 0.85
-"""Cosines of the angles to the film's own up within which a guess of up is right, and an axis is taken for it."""
-OBJECT = "object"
-"""Name of the whole in a length."""
-SHORTER, LONGER = 0.25, 4.0
-"""Range of lengths, per the guess, if the weight is to tell them."""
-
+SECONDS, LEAD = 1.5, 0.4  # time of motion that is fitted, and time at rest that is kept before it [s]
+SOFTER, STIFFER = 1 / 30, 30.0  # range of E, per that which the preview guesses
+SPEED = (0.5, 25.0)  # range of the wind [m/s]
+ROUGH = 1.2e-3  # residual of a camera that may be wrong, per diagonal of the picture
+UPRIGHT, NEARLY = 0.5, 0.85  # cosines to the film's up of a guess that is right, and of an axis that is taken
+OBJECT = "object"  # name of the whole in a length
+SHORTER, LONGER = 0.25, 4.0  # range of lengths, per the guess, if the weight is to tell them
 Length = tuple[str, float] | Literal["gravity"] | None
 
 
@@ -294,8 +294,6 @@ def extent(points: Tensor, up: Sequence[float]) -> float:
 
 def _place(name: str, number: int, seen: Seen) -> Tensor:
     """The place in the splat that a pixel of the first frame shows, shape (3,)."""
-    import numpy as np
-
     try:
         x, y = (float(value) / seen.film.full for value in name.split(":")[number].split(","))
     except ValueError:

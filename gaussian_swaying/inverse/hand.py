@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,38 +16,18 @@ from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.simulation.simulation import Simulation
 
-SHARE = 0.02
-"""Share of a pixel from which what moves is seen in it."""
-
-REACH = 0.25
-"""Distance that what is simulated is expected to go, as a share of its longer side in the picture. What goes farther is
-left to the robust estimates."""
-
-LOOKS = 8
-"""Frames that are compared with the first one to see whether a camera moves."""
-
-DRAWN, FIRST = 2, 4
-"""Pictures that are drawn for a frame, and for the first one."""
-
-AGREE, MANY = 0.25, 0.2
-"""Least share of the points of a frame that agree on its camera, and share of the frames without background above which
-a fit is doubtful."""
-
-BLOCK = 4
-"""Side of the squares over which colours are averaged [pixels], so that edges, noise and compression count little."""
-
-DARK, BRIGHT = 8, 247
-"""Mean grey level up to which a square tells nothing, and that of a pixel from which it may be cut off."""
-
-FEWEST_SQUARES = 50
-"""Fewest squares that make a gain."""
+SHARE = 0.02  # share of a pixel from which what moves is seen in it
+REACH = 0.25  # how far what is simulated goes, per its longer side in the picture
+LOOKS = 8  # frames that are compared with the first one to see whether a camera moves
+DRAWN, FIRST = 2, 4  # pictures that are drawn for a frame, and for the first one
+AGREE, MANY = 0.25, 0.2  # share of points that agree on a camera; of frames without background in a doubtful fit
+BLOCK = 4  # side of squares over which colours are averaged [pixels]
+DARK, BRIGHT = 8, 247  # mean grey level that tells nothing, and that of a pixel which may be cut off
+FEWEST_SQUARES = 50  # fewest squares that make a gain
 
 
 class Background:
-    """Draws a scene at rest, and says which pixels show what stands still.
-
-    That is what is not simulated, without the parts of the splat that are named in ``also_moves``.
-    """
+    """Draws a scene at rest, and says which pixels show what is not simulated, nor named in ``also_moves``."""
 
     def __init__(self, simulation: Simulation, also_moves: Sequence[str] = ()) -> None:
         scene = simulation.scene
@@ -63,19 +44,18 @@ class Background:
         self.exists = not bool((simulated | named).all())
         self._moves = torch.stack([simulated, named, named], 1).to(self._rest.means)
 
+    @torch.no_grad()
     def draw(self, camera: Camera) -> tuple[RenderOutput, Tensor]:
         """The picture of the scene at rest, and its background: bool, on the CPU, shape (H, W)."""
         painter, rest = self._painter, self._rest
         camera = camera.to(painter.device)
-        with torch.no_grad():
-            picture = painter.picture(rest, camera)
-            drawn = painter.renderer(rest.means, rest.covariances, painter.opacity(), self._moves, camera).color
+        picture = painter.picture(rest, camera)
+        drawn = painter.renderer(rest.means, rest.covariances, painter.opacity(), self._moves, camera).color
         simulated, named, _ = (drawn > SHARE).cpu().unbind(-1)
         return picture, (picture.alpha[..., 0].cpu() > SOLID) & ~_widened(simulated) & ~named
 
 
 def _widened(moving: Tensor) -> Tensor:
-    """A mask (H, W) with all that is nearer to it than what moves is expected to go."""
     cv2 = opencv()
     rows, columns = moving.nonzero().unbind(1)
     if not len(rows):
@@ -87,11 +67,8 @@ def _widened(moving: Tensor) -> Tensor:
 def moves_by(video: Footage, background: Background) -> float:
     """Distance that the background goes in the film of a camera that is said to stand still [pixels]; 0 if unknown.
 
-    It is the median over points and the largest of :data:`LOOKS` frames. Of each point only the motion across its edge
-    counts, as nothing holds it along a plain pole.
+    Of each point only the motion across its edge counts, as nothing holds it along a plain pole.
     """
-    import numpy as np
-
     cv2 = opencv()
     _, still = background.draw(video.cameras[0])
     first = grey_of(video.images[0])
@@ -117,10 +94,10 @@ def stands_still(video: Footage) -> bool:
 def follow_camera(
     video: Footage, background: Background, tick: Callable[[int], object] = int
 ) -> tuple[Footage, tuple[int, ...], float]:
-    """The video with the camera of each frame; its own may be that of the first frame, or rough ones of all.
+    """The video with the camera of each frame, from that of the first frame, or rough ones of all.
 
     Frames that show too little of the background are listed, and have a camera between those of their neighbours. The
-    number is the median over the frames of the root mean square distance of the points that agree [pixels].
+    number is the median distance of points that agree [pixels].
     """
     found: list[Registration | None] = []
     last: Camera | None = None
@@ -149,8 +126,6 @@ def follow_camera(
 
 
 def _filled(video: Footage, found: Sequence[Registration | None]) -> tuple[Camera, ...]:
-    """The cameras of all frames; those that are missing (None) lie between their neighbours in time."""
-    import numpy as np
     from scipy.spatial.transform import Rotation, Slerp
 
     known = [(time, one.camera) for time, one in zip(video.times, found, strict=True) if one is not None]
@@ -175,8 +150,6 @@ def gains(video: Footage, background: Background) -> tuple[Tensor, tuple[int, ..
 
     Frames that show too little of the background have those of their neighbours, and are listed; None if all do.
     """
-    import numpy as np
-
     found: list[Tensor | None] = []
     drawn: tuple[Camera, Tensor, Tensor] | None = None
     for camera, image in zip(video.cameras, video.images, strict=True):
@@ -213,30 +186,20 @@ def with_gains(images: Tensor, found: Sequence[Tensor] | Tensor) -> Tensor:
 
 
 def _averaged(picture: Tensor) -> Tensor:
-    """Means over squares of a picture (H, W, C), shape (N, C)."""
     return torch.nn.functional.avg_pool2d(picture.permute(2, 0, 1)[None], BLOCK)[0].flatten(1).T
 
 
 @dataclass
 class Judged:
-    """The judgement of the background on the film of a camera.
-
-    Attributes:
-        camera: Name of the camera.
-        moved: Distance that the background goes in the film of a camera that is said to stand still [pixels].
-        hand_held: Whether the camera of each frame was found.
-        residual: Median distance of points of the background from where these cameras see them [pixels].
-        unseen: Number of frames that show too little of the background; they have the camera of their neighbours.
-        gains: Smallest and largest gain of red, green and blue, shape (2, 3); empty if it is not known.
-    """
+    """What the background says of the film of a camera."""
 
     camera: str
     frames: int
-    moved: float = 0.0
+    moved: float = 0.0  # pixels
     hand_held: bool = False
-    residual: float = 0.0
-    unseen: int = 0
-    gains: Sequence[Sequence[float]] = ()
+    residual: float = 0.0  # pixels
+    unseen: int = 0  # frames that show too little of it
+    gains: Sequence[Sequence[float]] = ()  # smallest and largest of red, green and blue
 
     def sentences(self) -> list[str]:
         found = []
@@ -270,12 +233,6 @@ def prepared(
     tick: Callable[[int], object] = int,
 ) -> tuple[list[Footage], list[Judged]]:
     """Find the camera of each frame of films from a hand, and take drifts of exposure and white balance off all films.
-
-    Args:
-        hand_held: Whether their cameras move otherwise than they are said to. None: those whose frames all have one
-            camera, but whose background moves by more than half a pixel.
-        also_moves: Names of parts of the splat that move in the films, though the simulation does not move them.
-        say: Called with a line for each thing that is done; ``tick`` with the number of frames whose camera was found.
 
     Returns:
         The films, and what the background says of each; nothing if the splat has none.

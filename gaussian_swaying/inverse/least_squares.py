@@ -10,25 +10,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-STEP = 0.004
-"""Step of the finite differences, as a share of the range."""
-
-HUBER = 1.345
-"""Standard deviations above which a residual counts less (Huber 1981: 95 % efficiency)."""
-
-REACH = 0.25
-"""Longest first step, as a share of each range."""
-
-CLOSELY, ROUGHLY = (3e-4, 1e-4), (9e-3, 3e-3)
-"""Shortest step, as a share of the ranges, and least gain, as a share of the cost, that are worth another one: of the
-last stage, and of the others."""
-
-ALIKE = 1.1
-"""Ratio of standard deviations of the residuals below which they stay."""
-
-LEAST = 0.05
-"""Least standard deviation of the residuals [pixels]."""
-
+STEP = 0.004  # step of the finite differences, as a share of the range
+HUBER = 1.345  # standard deviations above which a residual counts less (Huber 1981: 95 % efficiency)
+REACH = 0.25  # longest first step, as a share of each range
+CLOSELY, ROUGHLY = (3e-4, 1e-4), (9e-3, 3e-3)  # shortest step, and least gain per cost, of the last stage and others
+ALIKE = 1.1  # ratio of standard deviations of the residuals below which they stay
+LEAST = 0.05  # least standard deviation of the residuals [pixels]
 NO_STEP = "no step is better"
 DIVERGED = "Every simulation of a step diverged: narrow the ranges of `unknowns`."
 
@@ -48,8 +35,7 @@ class Block:
     moment: Tensor | None = None
 
 
-Residuals = Callable[[Tensor], Block]
-"""Residuals at some points (B, U), each a share of every range."""
+Residuals = Callable[[Tensor], Block]  # residuals at some points (B, U), each a share of every range
 
 
 class DivergedError(ValueError):

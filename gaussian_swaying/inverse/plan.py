@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
 LISTS = ("base", "videos", "cameras", "assumed", "also_moves")
-ASSUMED = ("length", "mass", "camera")
-"""Things in a base that nobody measured, perhaps."""
+ASSUMED = ("length", "mass", "camera")  # things in a base that nobody measured, perhaps
 
 
 @dataclass(frozen=True)

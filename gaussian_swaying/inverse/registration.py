@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,47 +18,31 @@ from gaussian_swaying.gaussians.measures import Gaussians
 from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.geometry.origin import Origin
 from gaussian_swaying.geometry.rotations import rotation_of
-from gaussian_swaying.inverse.tracks import corners, follow, opencv
+from gaussian_swaying.inverse.tracks import ALIKE, GREY, alike, corners, follow, opencv, picture_of
+from gaussian_swaying.inverse.unknowns import FILM_START
+from gaussian_swaying.inverse.videos import Footage
 from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
 from gaussian_swaying.rendering.protocol import RenderOutput
+from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.suggestion.up import guess_up
 
-RATIO = 0.8
-"""Largest distance of a feature to its match, per that to the next best one (Lowe 2004)."""
-
-NEAR, CLOSE = 0.006, 1.5
-"""Largest distance between a point and its match that agree on a camera, as a share of the picture's diagonal, and that
-of points that are followed on thin things [pixels]."""
-
-LEAST, ENOUGH = 12, 60
-"""Fewest matches that make a camera, and features that agree with which none need to be followed."""
-
-SOLID = 0.9
-"""Least opacity of the picture at a feature, whose depth is then known."""
-
-REFINED, ROUNDS = 5, 3
-"""Times that a camera is refined and the points that agree on it are chosen anew, and pictures that are drawn from a
-camera that is already near, for features and for points that are followed."""
-
-VIEW, ROOM = 50.0, 1.3
-"""Vertical field of view with which a search begins if it is not known [degrees], and distance of the first cameras,
-per that at which the object fills the picture."""
-
+RATIO = 0.8  # largest distance of a feature to its match, per that to the next best one (Lowe 2004)
+NEAR, CLOSE = 0.006, 1.5  # distance of points that agree on a camera, per diagonal; of followed ones [pixels]
+LEAST, ENOUGH = 12, 60  # fewest matches that make a camera, and features that agree with which none need to be followed
+SOLID = 0.9  # least opacity of the picture at a feature, whose depth is then known
+REFINED, ROUNDS = 5, 3  # times that agreeing points are chosen anew, and pictures from a camera that is near
+VIEW, ROOM = 50.0, 1.3  # field of view that is tried first [degrees], and distance per that of a full picture
+FOUND = 0.2  # least share of the points of the splat's picture that look alike in a frame that shows it
+AWAY = 3.0  # largest distance of a first frame from the splat at rest [pixels]
+LARGER, ASIDE = 1.08, 10.0  # ratio of distances, and angle [degrees], from which a camera is another one
 PICTURE, CAMERAS = "registration.png", "transforms.json"
 STILLS = (".png", ".jpg", ".jpeg")
-Draw = Callable[[Camera], RenderOutput]
-"""Draws the splat, at rest."""
+Draw = Callable[[Camera], RenderOutput]  # draws the splat, at rest
 
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """The camera of a frame.
-
-    Attributes:
-        matches: Points that were matched at the end.
-        agreeing: Those that agree on the camera.
-        residual: Root mean square of their distances [pixels].
-    """
+    """The camera of a frame, the points that were matched and agree on it, and their root mean square [pixels]."""
 
     camera: Camera
     matches: int
@@ -72,9 +57,9 @@ def painter_of(cloud: GaussianCloud) -> Draw:
     renderer = make_renderer(torch.device("cpu"))
     shape, colour = covariance(cloud.quats, cloud.scales), (0.5 + SH_DC * cloud.sh[:, 0]).clamp(0, 1)
 
+    @torch.no_grad()
     def draw(camera: Camera) -> RenderOutput:
-        with torch.no_grad():
-            return renderer(cloud.means, shape, cloud.opacities.sigmoid(), colour, camera.to(dtype=torch.float32))
+        return renderer(cloud.means, shape, cloud.opacities.sigmoid(), colour, camera.to(dtype=torch.float32))
 
     return draw
 
@@ -107,10 +92,7 @@ def cameras_around(
     count: int = 12,
     elevations: Sequence[float] = (0.0, 30.0),
 ) -> list[Camera]:
-    """Cameras around an object at a distance [scene units] from which a registration may start.
-
-    They look from so many directions at each elevation [degrees] above the level.
-    """
+    """Cameras around an object at a distance [scene units], so many at each elevation [degrees], to start with."""
     middle = torch.as_tensor(center, dtype=torch.float64)
     axis = torch.nn.functional.normalize(torch.as_tensor(up, dtype=torch.float64), dim=0)
     first = torch.linalg.cross(axis, torch.eye(3, dtype=torch.float64)[int(axis.abs().argmin())])
@@ -144,11 +126,8 @@ def transforms(camera: Camera, film: str, origin: Origin) -> dict[str, Any]:
 def find_camera(draw: Draw, frame: Tensor, start: Sequence[Camera], *, focal: bool = False) -> Registration:
     """Find the camera of a frame, uint8 (H, W, 3), of something at rest, without lens distortion.
 
-    Args:
-        draw: Draws the splat, at rest.
-        start: Cameras to begin with, of the frame's size and with its intrinsics; the one with the most matches that
-            agree is taken. One is enough if it is within some 20 degrees.
-        focal: Whether the focal length is to be found, too. It needs depth in what is seen, or a slanted surface.
+    Of the cameras to start with, that with the most matches is taken; one is enough within some 20 degrees. The
+    ``focal`` length needs depth in what is seen.
 
     Raises:
         ValueError: If the frame and the cameras do not fit, or the splat is not found in the frame.
@@ -189,15 +168,12 @@ def _near(camera: Camera) -> float:
 def grey_of(image: Tensor) -> Any:
     """An image of bytes or of colours in [0, 1], (H, W, 3), as grey bytes whose contrast is the same everywhere."""
     whole = image.float() if image.dtype == torch.uint8 else image.detach().float().cpu().clamp(0, 1) * 255
-    grey = whole @ torch.tensor([0.299, 0.587, 0.114])
     equal = opencv().createCLAHE(clipLimit=3.0, tileGridSize=(8, 8))  # takes what another light changes
-    return equal.apply(grey.round().to(torch.uint8).numpy())
+    return equal.apply((whole @ GREY).round().to(torch.uint8).numpy())
 
 
 def in_space(picture: RenderOutput, camera: Camera, pixel: Any) -> tuple[Any, Any]:
     """Places on the surface that pixels (N, 2) of a picture show, float64, and a mask of those whose depth is known."""
-    import numpy as np
-
     cv2, alpha = opencv(), picture.alpha[..., 0].detach().cpu().numpy()
     depth = picture.depth[..., 0].detach().cpu().numpy() / np.maximum(alpha, 1e-3)
     if not len(pixel):
@@ -220,9 +196,6 @@ def off_camera(world: Any, there: Any, intrinsics: Any, near: float) -> Any:
 
 
 def _pose(world: Any, there: Any, K: Any, near: float) -> tuple[Any, Any, Any, Any] | None:
-    """Which points (T, 3) agree on a pose, its rotation vector and shift, and how far all are off [pixels]."""
-    import numpy as np
-
     cv2, how = opencv(), {"iterationsCount": 2000, "confidence": 0.9999, "flags": opencv().SOLVEPNP_AP3P}
     done, turn, shift, agree = cv2.solvePnPRansac(world, there, K, None, reprojectionError=near, **how)
     if not done:
@@ -240,9 +213,6 @@ def _pose(world: Any, there: Any, K: Any, near: float) -> tuple[Any, Any, Any, A
 def _by_features(
     sift: Any, wanted: tuple[Any, Any], picture: RenderOutput, camera: Camera, focal: bool = False
 ) -> Registration | None:
-    """The camera from matched features; None if too few agree."""
-    import numpy as np
-
     mask = (picture.alpha[..., 0].detach().cpu().numpy() > SOLID).astype(np.uint8)
     points, codes = sift.detectAndCompute(grey_of(picture.color), mask)
     if codes is None or wanted[1] is None or len(points) < LEAST or len(wanted[0]) < LEAST:
@@ -257,16 +227,8 @@ def _by_features(
 
 
 def _by_flow(
-    grey: Any,
-    picture: RenderOutput,
-    camera: Camera,
-    focal: bool,
-    near: float = CLOSE,
-    where: Tensor | None = None,
+    grey: Any, picture: RenderOutput, camera: Camera, focal: bool, near: float = CLOSE, where: Tensor | None = None
 ) -> Registration | None:
-    """The camera from points that are followed from the picture to the frame; None if too few are."""
-    import numpy as np
-
     cv2, drawn = opencv(), grey_of(picture.color)
     solid = picture.alpha[..., 0].detach().cpu().numpy() > SOLID
     solid = solid if where is None else solid & where.numpy()
@@ -282,8 +244,6 @@ def _seen_from(
     picture: RenderOutput, camera: Camera, here: Any, there: Any, focal: bool, near: float
 ) -> Registration | None:
     """The camera that sees what the picture shows at ``here`` at ``there``; None if too few pairs agree."""
-    import numpy as np
-
     cv2, K = opencv(), camera.intrinsics.double().cpu().numpy()
     world, known = in_space(picture, camera, here)
     world, there = world[known], np.ascontiguousarray(there[known], dtype=np.float64)
@@ -303,3 +263,63 @@ def _seen_from(
     view[:3, :3], view[:3, 3] = cv2.Rodrigues(turn)[0], shift.reshape(3)
     seen = replace(camera, world_to_camera=torch.from_numpy(view), intrinsics=torch.from_numpy(np.asarray(K, float)))
     return Registration(seen, int(known.sum()), len(world), float(np.sqrt((off**2).sum(1).mean())))
+
+
+def shown_in(picture: RenderOutput, frame: Tensor) -> tuple[float, float]:
+    """Share of the points of the splat's picture that are alike in a frame (H, W, 3), and how far they are [pixels]."""
+    drawn, real = grey_of(picture.color), grey_of(frame)
+    mask = (picture.alpha[..., 0].detach().cpu().numpy() > SOLID).astype(np.uint8)
+    start = corners(drawn, 300, 0.01, 5, mask)
+    if not len(start):
+        return 0.0, math.inf
+    pair = np.stack([drawn, real])
+    place, seen = follow(pair, start)
+    good = torch.from_numpy(seen[1]) & (alike(torch.from_numpy(pair)[..., None], torch.from_numpy(place)) > ALIKE)
+    off = torch.from_numpy(place[1] - place[0])[good].norm(dim=-1)
+    return float(good.double().mean()), float(off.median()) if len(off) else math.inf
+
+
+def first_look(simulation: Simulation, video: Footage, moving: bool) -> list[str]:
+    """A sentence if the camera of a video is not where it is said to be; ValueError if it does not show the splat.
+
+    A film that begins in motion may look like anything in its first frame.
+    """
+    from scipy.spatial.transform import Rotation
+
+    rest, frame, given = simulation.scene.rest(), video.images[0], video.cameras[0]
+
+    def draw(camera: Camera) -> RenderOutput:
+        return picture_of(simulation, rest, camera.to(dtype=torch.float32))
+
+    share, off = shown_in(draw(given), frame)
+    other = None if share >= FOUND and off <= AWAY else _elsewhere(draw, frame, given, share)
+    if other is None and share < FOUND and not moving:
+        raise ValueError(
+            f"The first frame of camera {video.name} does not show the splat where its camera looks: give a film of "
+            "this splat, or find its camera with `gaussian-swaying camera FILM SPLAT` (its places may be in another "
+            f"unit); if it begins in motion, add {FILM_START}: {{range: [-1, 0]}} to `unknowns`."
+        )
+    if other is None:
+        return []
+    middle = rest.means.double().cpu().mean(0)
+    near, far = ((camera.position.double().cpu() - middle).norm() for camera in (other, given))
+    larger = float(far / near)
+    turn = other.world_to_camera[:3, :3].double().cpu() @ given.world_to_camera[:3, :3].double().cpu().T
+    angle = math.degrees(Rotation.from_matrix(turn.numpy()).magnitude())
+    if max(larger, 1 / larger) < LARGER and angle < ASIDE:
+        return []
+    return [
+        f"The first frame of camera {video.name} shows the splat {larger:.2f} times as large and {angle:.0f} degrees "
+        "from where its `transform_matrix` says: its places are in another unit than the splat, or it is another "
+        "camera. Find it with `gaussian-swaying camera FILM SPLAT`."
+    ]
+
+
+def _elsewhere(draw: Draw, frame: Tensor, given: Camera, share: float) -> Camera | None:
+    """Another camera, from which more than a share of the splat's points are alike in a frame; None if none is."""
+    try:
+        found = find_camera(draw, frame, [given]).camera
+    except ValueError:
+        return None
+    better, off = shown_in(draw(found), frame)
+    return found if better >= max(FOUND, share) and off < 0.5 * AWAY else None

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,41 +19,29 @@ from gaussian_swaying._files import write_json, write_table, write_text
 from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.inverse.hand import Judged
-from gaussian_swaying.inverse.pictures import BEFORE, titled
+from gaussian_swaying.inverse.tracks import Tracks, opencv, picture_of
 from gaussian_swaying.inverse.unknowns import SCALE, Unknown, of_simulation, values_at
 from gaussian_swaying.inverse.videos import Footage
 from gaussian_swaying.recording.video import VideoEncoder
+from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.simulation.model import POLAR, flow_of, in_settings
-from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.simulation.simulation import Simulation, classify
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
-PICTURES = "pictures"
-PSNR = ("fitted", "predicted", "rest")
-
-ASTRAY = 6.0
-"""Largest accepted PSNR loss of fitted frames against the frame at rest [dB]; 6 dB is four times the squared error."""
-
-FOLLOWED, LOST = 0.95, 0.5
-"""Share of the tracked motion that the simulation has to explain in a good fit, and below which a fit has failed."""
-
-VAGUE, TURNED = 0.25, 5.0
-"""Standard error, as a share of the range (of the value on a logarithmic scale), and of an angle [degrees], above which
-an unknown is called not determined."""
-
+PICTURES, BEFORE = "pictures", "before"
+BAND = 22  # height of the line of text above a picture [pixels]
+HELD_TINT, MOVING, STILL_TINT = (0.85, 0.1, 0.1), (0.1, 0.65, 0.25), (0.55, 0.55, 0.55)
+ASTRAY = 6.0  # largest accepted PSNR loss of fitted frames against the frame at rest [dB]
+FOLLOWED, LOST = 0.95, 0.5  # share of the tracked motion that a good fit explains, and below which a fit has failed
+VAGUE, TURNED = 0.25, 5.0  # standard error per range or value, and of an angle [degrees], that determines nothing
 CHECK = "Raise `search`, widen the ranges, check the base and `known`"
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """Comparison of the fitted simulation with the video of one camera.
-
-    Attributes:
-        fitted: PSNR of the fitted frames [dB].
-        predicted: PSNR of the predicted frames [dB]; NaN if there are none.
-        rest: PSNR of the first frame, at rest [dB]: what noise, light and the splat itself leave, before any motion.
-    """
+    """PSNR of a camera's frames that were fitted, of those that were predicted (NaN if none), and at rest [dB]."""
 
     camera: str
     fitted: float
@@ -67,14 +56,12 @@ class Fit:
     Attributes:
         covariance: Covariance of the places, as shares of the ranges, shape (U, U).
         shown: Comparison with the video of each camera.
-        unsettled: The reason why the values are not a local minimum, and a remedy; empty if they are one.
+        unsettled: Why the values are not a local minimum, and a remedy; empty if they are one.
         notes: What the videos say against the plan.
-        followed: For each camera, the share of the motion of its tracks in the fitted frames that the simulation
-            explains: 1 - (sum of squared distances) / (sum of squared displacements), of tracks that were not fitted
-            and without half a pixel of noise; at least 0 for each track. Without tracks it is empty.
-        assumed: What the values rest on that nobody measured, as sentences.
-        seen: Where the wind blows, as each camera sees it, as sentences.
-        judged: What the background says of the video of each camera; nothing without one.
+        followed: For each camera the share of the motion of its held-out tracks that is explained, 0 to 1.
+        assumed: What the values rest on that nobody measured.
+        seen: Where the wind blows, as each camera sees it.
+        judged: What the background says of each video.
         rivals: Other values that fit nearly as well.
     """
 
@@ -193,7 +180,7 @@ def predictions(
     ``film_CAMERA.mp4``, the video beside the fit, is written into the folder ``films``.
     """
     squares: list[tuple[list[float], list[float]]] = [([], []) for _ in videos]
-    painter, encoders = simulation.painter, list[VideoEncoder]()
+    encoders = list[VideoEncoder]()
     with ExitStack() as left:
         for video in videos if films else ():
             films.mkdir(exist_ok=True)  # type: ignore[union-attr]
@@ -204,8 +191,8 @@ def predictions(
             for number, video in enumerate(videos):
                 if (frame := video.frame_at(time)) is None:
                     continue
-                drawn = painter.picture(gaussians, video.cameras[frame].to(painter.device))
-                shown, real = drawn.color.clamp(0, 1).float().cpu(), video.images[frame].float() / 255
+                drawn = picture_of(simulation, gaussians, video.cameras[frame]).color
+                shown, real = drawn.clamp(0, 1).float().cpu(), video.images[frame].float() / 255
                 squares[number][k >= fitted].append(float((shown - real).square().mean()))
                 if encoders:
                     title = "predicted" if k >= fitted else "fitted"
@@ -227,7 +214,10 @@ def write_results(
     told = {
         "values": result.rows(),
         "covariance_of_shares": result.covariance.tolist(),
-        "cameras": [{"camera": one.camera} | {f"psnr_{n}_db": getattr(one, n) for n in PSNR} for one in result.shown],
+        "cameras": [
+            {name if name == "camera" else f"psnr_{name}_db": value for name, value in vars(one).items()}
+            for one in result.shown
+        ],
         "verdict": result.verdict,
         "why": [*failed, *doubtful],
         "motion_explained": result.followed,
@@ -303,43 +293,79 @@ def _psnr(squares: Sequence[float]) -> float:
     return -10 * math.log10(mean) if mean != 0 else math.inf
 
 
-_STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; margin: 2em auto; max-width: 70em; padding: 0 1em; color: #222; }
-table { border-collapse: collapse; } td, th { padding: .2em .8em; text-align: right; border-bottom: 1px solid #ddd; }
-td:first-child { text-align: left; } video, img { max-width: 100%; border: 1px solid #ddd; } video { max-height: 85vh; }
-.good { color: #06752e; } .doubtful { color: #9a6200; } .failed { color: #b00020; }
-"""
-
-
 def write_page(folder: Path, result: Fit) -> None:
     """Write ``page.html``, named after the last two folders of its path, with the films and pictures of the fit."""
     name = html.escape("/".join(folder.resolve().parts[-2:]))
-    failed, doubtful = result.doubts()
-
-    def listed(sentences: Sequence[str]) -> str:
-        return "<ul>" + "".join(f"<li>{html.escape(one)}</li>" for one in sentences) + "</ul>" if sentences else ""
-
-    rows = "".join(
-        f"<tr><td>{html.escape(row['name'])}</td><td>{row['value']:.5g}</td><td>± {row['standard_error']:.2g}</td>"
-        f"<td>{html.escape(row['unit'])}</td><td>{row['low']:g} to {row['high']:g}</td></tr>"
-        for row in result.rows()
-    )
     shown = "".join(
         f'<h3>Camera {html.escape(one.camera)}</h3><video src="{PICTURES}/film_{quote(one.camera)}.mp4" autoplay loop '
         f'muted controls></video><img src="{BEFORE}/rest_{quote(one.camera)}.png" alt="the scene at rest">'
         f'<img src="{BEFORE}/tracks_{quote(one.camera)}.png" alt="points that are followed">'
         for one in result.shown
     )
-    text = f"""<!doctype html>
-<html lang="en"><meta charset="utf-8"><title>{name}</title><style>{_STYLE}</style>
-<h1>{name}</h1>
-<p class="{result.verdict}"><b>This fit {"has failed" if failed else f"is {result.verdict}"}.</b></p>
-{listed([*failed, *doubtful])}
-<table><tr><th></th><th>value</th><th>standard error</th><th></th><th>range</th></tr>{rows}</table>
-{listed([*result.seen, *result.assumed])}
-<h2>The film beside the fit, the scene at rest, and the points that are followed</h2>
-<p>At half speed. What is called predicted was not fitted.</p>
-{shown}
-<script>for (const film of document.querySelectorAll('video')) film.playbackRate = 0.5;</script></html>
-"""
+    head = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{name}</title>'
+    style = "<style>video, img { max-width: 100%; max-height: 85vh } pre { white-space: pre-wrap }</style>"
+    slow = "<script>for (const film of document.querySelectorAll('video')) film.playbackRate = 0.5;</script>"
+    text = f"{head}{style}<h1>{name}</h1><pre>{html.escape(result.text())}</pre>{shown}{slow}</html>\n"
     write_text(folder / "page.html", text)
+
+
+def write_before(
+    folder: Path, simulation: Simulation, videos: Sequence[Footage], tracks: Sequence[Tracks]
+) -> list[Path]:
+    """Write ``rest_CAMERA.png`` and ``tracks_CAMERA.png``, and return the files."""
+    import imageio.v3 as iio
+
+    folder.mkdir(parents=True, exist_ok=True)
+    found = []
+    for video, own in zip(videos, tracks, strict=True):
+        for name, picture in (("rest", _at_rest(simulation, video)), ("tracks", _tracks_picture(video, own))):
+            found.append(folder / f"{name}_{video.name}.png")
+            iio.imwrite(found[-1], picture)
+    return found
+
+
+def side_by_side(frame: Tensor, shown: RenderOutput) -> list[tuple[str, Tensor]]:
+    """A frame, dtype uint8, (H, W, 3), the splat half over it, and the splat, each with a title."""
+    real, drawn = frame.float() / 255, shown.color.detach().float().cpu().clamp(0, 1)
+    cover = 0.5 * shown.alpha.detach().float().cpu()
+    return [("first frame", real), ("splat half over it", real * (1 - cover) + drawn * cover), ("splat", drawn)]
+
+
+def _at_rest(simulation: Simulation, video: Footage) -> Any:
+    """The first frame, the scene at rest half over it and alone, and what is held there."""
+    painter, rest, parts = simulation.painter, simulation.scene.rest(), classify(simulation)
+    colours = torch.tensor(STILL_TINT).repeat(len(parts.simulated), 1)
+    colours[(parts.simulated | parts.carried).cpu()] = torch.tensor(MOVING)
+    colours[parts.pinned.cpu()] = torch.tensor(HELD_TINT)
+    panels = side_by_side(video.images[0], picture_of(simulation, rest, video.cameras[0]))
+    roles = painter.draw(rest, colours.to(painter.device), video.cameras[0].to(painter.device))
+    panels.append(("red: held, green: moves, grey: still", roles.color.detach().float().cpu().clamp(0, 1)))
+    return titled(panels)
+
+
+def _tracks_picture(video: Footage, tracks: Tracks) -> Any:
+    """The first frame, pale, with the ways of the points that are followed."""
+    cv2 = opencv()
+    picture = (video.images[0].float() * 0.4 + 255 * 0.6).round().to(torch.uint8).numpy()
+    for seen, way in zip(tracks.seen.T, tracks.position.transpose(0, 1), strict=True):
+        places = way[seen].numpy().astype(np.int32)
+        colour = (20, 90, 220) if bool(seen[-1]) else (220, 120, 0)
+        cv2.polylines(picture, [places], False, colour, 1, cv2.LINE_AA)
+        for place in places[:1]:
+            cv2.circle(picture, place.tolist(), 2, colour, cv2.FILLED, cv2.LINE_AA)
+    told = f"{tracks.position.shape[1]} points followed; orange: {int((~tracks.seen[-1]).sum())} lost"
+    return titled([(told, torch.from_numpy(picture).float() / 255)])
+
+
+def titled(panels: Sequence[tuple[str, Tensor]]) -> Any:
+    """Pictures (H, W, 3) side by side, colours in [0, 1], as a NumPy array, with a title above each."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    joined = torch.cat([panel for _, panel in panels], 1)
+    height, width = joined.shape[:2]
+    picture = Image.new("RGB", (width, height + BAND), (255, 255, 255))
+    picture.paste(Image.fromarray((joined.clamp(0, 1) * 255).round().to(torch.uint8).numpy()), (0, BAND))
+    draw, font = ImageDraw.Draw(picture), ImageFont.load_default(13)
+    for number, (title, _) in enumerate(panels):
+        draw.text((number * width // len(panels) + 6, 3), title, fill=(0, 0, 0), font=font)
+    return np.asarray(picture)

@@ -1,8 +1,4 @@
-"""Point tracks: Gaussians that a camera sees at rest, followed through its video by Lucas and Kanade's method.
-
-The tracker is OpenCV's pyramidal Lucas-Kanade (Bouguet 2000), frame to frame. A track ends where following it back
-does not return to where it came from.
-"""
+"""Point tracks: Gaussians followed through a video by OpenCV's pyramidal Lucas-Kanade (Bouguet 2000)."""
 
 from __future__ import annotations
 
@@ -10,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,19 +18,26 @@ from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.simulation.draw import Painter
 from gaussian_swaying.simulation.simulation import Simulation
 
-WINDOW, WIDE = 15, 960
-"""Side of the square that is followed, where the longer side of the picture has at most ``WIDE`` [pixels]."""
+LEVELS = 3
+BACK = 0.5  # largest distance between a point and the one found by following it back [pixels]
+STILL = 0.5  # largest distance that a point moves which stands still [pixels]: noise and compression
+QUALITY = 0.02  # least texture of a point, as a share of the best one: smallest eigenvalue of the structure tensor
+EDGE = 4.0  # least distance from the edges of the picture [pixels]
+ALIKE = 0.7  # least correlation of a point's surroundings in a picture of the splat and in the first frame
+OPAQUE = 0.3  # least opacity of a Gaussian that is followed
+BEHIND = 0.03  # largest depth of a visible Gaussian behind the rendered depth, as a share of the object's size
+THIN = 0.25  # windows over the border are kept if fewer points than this share lie inside
+GREY = torch.tensor([0.299, 0.587, 0.114])
+WINDOW, WIDE = 15, 960  # side of the square that is followed, in pictures of at most this side [pixels]
+LARGE = 2.0  # standard deviations of Gaussians that are left out, per the side of a window
 
-LARGE = 2.0
-"""Standard deviations of Gaussians that are left out, per the side of a window."""
 
-
+@torch.no_grad()
 def drawn_beside(painter: Painter, gaussians: DeformedGaussians, camera: Camera, places: Tensor) -> Tensor:
     """Rendered minus projected centres of Gaussians, averaged over windows at places (T, 2) [pixels], float64, (T, 2).
 
     A picture whose colours are the projected centres shows in each pixel the mean centre of the Gaussians that are seen
-    there. The offset of a pixel is its own place minus this. Gaussians larger than windows, as those of a sky, are left
-    out.
+    there. Gaussians larger than windows, as those of a sky, are left out.
     """
     side, middle = window_of(camera.width, camera.height), torch.tensor([0.5 * camera.width, 0.5 * camera.height])
     pixel, depth = project(gaussians.means, camera)
@@ -42,8 +46,7 @@ def drawn_beside(painter: Painter, gaussians: DeformedGaussians, camera: Camera,
     centres = torch.cat([pixel - middle.to(pixel), torch.ones_like(pixel[:, :1])], 1)
     opacity = painter.opacity().detach()
     colours = torch.where(counts[:, None], centres, 0.0).to(opacity)
-    with torch.no_grad():
-        drawn = painter.renderer(gaussians.means, gaussians.covariances, opacity, colours, camera).color.cpu().double()
+    drawn = painter.renderer(gaussians.means, gaussians.covariances, opacity, colours, camera).color.cpu().double()
     y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
     mean, weight = drawn.split([2, 1], -1)
     sums = torch.cat([weight * (torch.stack([x, y], -1) - middle) - mean, weight], -1).permute(2, 0, 1)
@@ -58,41 +61,11 @@ def window_of(width: int, height: int) -> int:
     return 2 * round(WINDOW // 2 * max(1.0, max(width, height) / WIDE)) + 1
 
 
-LEVELS = 3
-BACK = 0.5
-"""Largest distance between a point and the one found by following it back [pixels]."""
-
-STILL = 0.5
-"""Largest distance that a point moves which stands still [pixels]: noise and compression."""
-
-QUALITY = 0.02
-"""Least texture of a point, as a share of the best one: smallest eigenvalue of the structure tensor."""
-
-EDGE = 4.0
-"""Least distance from the edges of the picture [pixels]."""
-
-ALIKE = 0.7
-"""Least correlation of a point's surroundings in a picture of the splat and in the first frame."""
-
-OPAQUE = 0.3
-"""Least opacity of a Gaussian that is followed."""
-
-BEHIND = 0.03
-"""Largest depth of a visible Gaussian behind the rendered depth, as a share of the object's size."""
-
-THIN = 0.25
-"""Gaussians near the border of the object are left out if at least this share of the visible ones lies a window away
-from it. In an object as thin as a window, all are kept."""
-
-
 @dataclass(frozen=True, eq=False)
 class Tracks:
     """Gaussians that were followed in the video of one camera.
 
-    Attributes:
-        index: Their indices among the moving Gaussians of the scene, shape (T,).
-        position: Position of each in the picture [pixels], float64, shape (F, T, 2).
-        seen: Whether the track is still valid, bool, shape (F, T).
+    Their indices among the moving ones (T,), positions [pixels], float64, (F, T, 2), and which are still valid (F, T).
     """
 
     index: Tensor
@@ -103,9 +76,7 @@ class Tracks:
 def track(simulation: Simulation, video: Footage, most: int = 400, first: DeformedGaussians | None = None) -> Tracks:
     """Follow the Gaussians that a camera sees in its first frame, those with the most texture.
 
-    Args:
-        first: What that frame shows, about, if it is not the scene at rest. The Gaussians are followed from a picture
-            of it to the frame; those whose surroundings do not look alike there are not seen.
+    If that frame shows other Gaussians than those at rest (``first``), they are followed from a picture of them.
     """
     chosen, start, drawn = _chosen(simulation, video, most, first)
     images = video.images if first is None else torch.cat([drawn[None], video.images])
@@ -116,13 +87,15 @@ def track(simulation: Simulation, video: Footage, most: int = 400, first: Deform
     return Tracks(chosen, position[1:], seen[1:])
 
 
-def drawn_by(simulation: Simulation, gaussians: DeformedGaussians, camera: Camera) -> Tensor:
-    """The picture of some Gaussians in a camera, dtype uint8, shape (H, W, 3)."""
-    painter = simulation.painter
-    own = camera.to(painter.device)
-    with torch.no_grad():
-        colour = painter.picture(gaussians, own).color
-    return (colour.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
+@torch.no_grad()
+def picture_of(simulation: Simulation, gaussians: DeformedGaussians, camera: Camera) -> RenderOutput:
+    """The picture of Gaussians of a simulation in a camera."""
+    return simulation.painter.picture(gaussians, camera.to(simulation.painter.device))
+
+
+def in_bytes(picture: RenderOutput) -> Tensor:
+    """The colours of a picture, dtype uint8, shape (H, W, 3)."""
+    return (picture.color.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
 
 
 def beside_rest(simulation: Simulation, video: Footage, most: int = 400) -> float:
@@ -152,10 +125,7 @@ def alike(images: Tensor, position: Tensor) -> Tensor:
 
 
 def still_until(simulation: Simulation, video: Footage, tracks: Tracks) -> float:
-    """Time of the last frame before a quarter of the points begins to move [s]; 0 if it moves in the first frames.
-
-    A point has moved if it is more than :data:`STILL` from where the camera of the frame would see it if it had stayed.
-    """
+    """Time of the last frame before a quarter of the points begins to move [s]; 0 if it moves in the first frames."""
     scene = simulation.scene
     means = scene.model.means.detach()[scene.moving[tracks.index.to(scene.moving.device)]]
     off = tracks.position - torch.stack([project(means, camera)[0] for camera in video.cameras])
@@ -165,24 +135,17 @@ def still_until(simulation: Simulation, video: Footage, tracks: Tracks) -> float
     return float(video.times[max(int(begun[0]) - 1, 0)]) if len(begun) else 0.0
 
 
+@torch.no_grad()
 def match(
     simulation: Simulation, video: Footage, states: Sequence[State], most: int = 400, moving: bool = False
 ) -> Tracks:
-    """Find the Gaussians of a simulation, which must be within tens of pixels, anew in each frame of the video.
+    """Find the Gaussians of a simulation, which must be within tens of pixels, anew in the frame of each of its states.
 
-    Where Gaussians overlap, the picture shows mostly the nearest ones. So it shows a Gaussian beside its projected
-    centre, by a part of a pixel that depends on the angle of view (:func:`drawn_beside`). A video of the real object
-    does not have this offset; one that was rendered from the splat has it, too. The first frame, at rest, shows which
-    is the case. The offset that remains there comes from a camera that is not quite right: its median is subtracted in
-    all frames, unless the video begins in motion. Gaussians near the border are left out, as the border of a splat is
-    not quite that of the real object.
-
-    Args:
-        states: The state at the time of each frame; fewer if only the first frames are wanted.
-        moving: Whether the video begins in motion.
+    Where Gaussians overlap, the picture shows one beside its projected centre (:func:`drawn_beside`); a video of the
+    real object does not. The first frame, at rest, shows which is the case. The offset that remains there comes from
+    the camera: its median is subtracted in all frames, unless the video begins in motion. Gaussians near the border are
+    left out, as the border of a splat is not quite that of the real object.
     """
-    import numpy as np
-
     scene, painter, count = simulation.scene, simulation.painter, len(video.times)
     chosen, *_ = _chosen(simulation, video, most, painter.deformed(states[0]) if moving else None)
     index = scene.moving[chosen.to(scene.moving.device)]
@@ -190,18 +153,14 @@ def match(
     seen = torch.zeros(count, len(chosen), dtype=torch.bool)
     share, shift = 0.0, torch.zeros(2, dtype=torch.float64)
     for k, state in enumerate(states):
-        camera = video.cameras[k].to(painter.device)
-        with torch.no_grad():
-            gaussians = painter.deformed(state)
-            picture = painter.picture(gaussians, camera)
+        gaussians = painter.deformed(state)
+        picture = picture_of(simulation, gaussians, video.cameras[k])
         pixel, depth = project(gaussians.means[index], video.cameras[k])
         there = _inside(pixel, picture, _in_sight(pixel, depth, picture, BEHIND * scene.size))
-        shown = (picture.color.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
-        pair = np.stack([shown, video.images[k].numpy()])
-        found, good = follow(pair, pixel.numpy())
+        found, good = follow(torch.stack([in_bytes(picture), video.images[k]]).numpy(), pixel.numpy())
         position[k], seen[k] = torch.from_numpy(found[1]), torch.from_numpy(good[1]) & there
         if k == 0 or share:
-            beside = drawn_beside(painter, gaussians, camera, pixel)
+            beside = drawn_beside(painter, gaussians, video.cameras[k].to(painter.device), pixel)
             if k == 0 and bool(seen[0].any()):
                 share, shift = _at_rest((position[0] - pixel)[seen[0]], beside[seen[0]])
                 shift = torch.zeros_like(shift) if moving else shift
@@ -211,7 +170,6 @@ def match(
 
 
 def _at_rest(off: Tensor, beside: Tensor) -> tuple[float, Tensor]:
-    """Return the share of the splat's offsets (T, 2) that a video at rest lacks, 0 to 1, and the median of the rest."""
     share = float((-(off * beside).sum() / beside.square().sum().clamp(min=1e-12)).clamp(0.0, 1.0))
     return share, (off + share * beside).median(0).values
 
@@ -221,19 +179,15 @@ def follow(images: Any, start: Any) -> tuple[Any, Any]:
 
     NumPy arrays: positions, float64, shape (F, T, 2), and whether each is still valid, shape (F, T).
     """
-    import numpy as np
-
     cv2 = opencv()
     count, (height, width) = len(start), images.shape[1:3]
-    options = {"winSize": (window_of(width, height),) * 2, "maxLevel": LEVELS}
-    options["criteria"] = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 40, 0.001)
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 40, 0.001)
+    options = {"winSize": (window_of(width, height),) * 2, "maxLevel": LEVELS, "criteria": stop}
     position = np.zeros((len(images), count, 2))
     seen = np.zeros((len(images), count), dtype=bool)
     now = np.ascontiguousarray(start - 0.5, dtype=np.float32)[:, None]
     position[0], seen[0] = now[:, 0] + 0.5, True
-    for k in range(1, len(images)):
-        if not count:
-            break
+    for k in range(1, len(images) if count else 0):
         there, found, _ = cv2.calcOpticalFlowPyrLK(images[k - 1], images[k], now, None, **options)
         back, returned, _ = cv2.calcOpticalFlowPyrLK(images[k], images[k - 1], there, None, **options)
         off = np.linalg.norm((back - now)[:, 0], axis=-1)
@@ -247,32 +201,25 @@ def follow(images: Any, start: Any) -> tuple[Any, Any]:
 
 def corners(grey: Any, most: int, quality: float, apart: float, mask: Any) -> Any:
     """Places with texture within a mask [pixels], at most so many and so far apart, NumPy array, shape (T, 2)."""
-    import numpy as np
-
     found = opencv().goodFeaturesToTrack(grey, most, quality, apart, mask=mask)
     return np.zeros((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64) + 0.5
 
 
+@torch.no_grad()
 def _chosen(
     simulation: Simulation, video: Footage, most: int, first: DeformedGaussians | None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return Gaussians that are visible at first and have texture around them, a few pixels apart, and their pixels.
-
-    The picture that shows the texture is the first frame, or that of other Gaussians; it is returned, too.
-    """
-    import numpy as np
-
-    scene, painter, camera = simulation.scene, simulation.painter, video.cameras[0]
-    image = video.images[0] if first is None else drawn_by(simulation, first, camera)
-    with torch.no_grad():
-        first, own = first or scene.rest(), camera.to(painter.device)
-        pixel, depth = project(first.means[scene.moving], camera)
-        picture = painter.picture(first, own)
+    """Gaussians that are visible at first, with texture and a few pixels apart, their pixels, and the picture."""
+    scene, camera = simulation.scene, video.cameras[0]
+    picture = picture_of(simulation, first or scene.rest(), camera)
+    image = video.images[0] if first is None else in_bytes(picture)
+    pixel, depth = project((first or scene.rest()).means[scene.moving], camera)
     opaque = scene.model.opacity().cpu()[scene.moving.cpu()] > OPAQUE
     place = (_in_sight(pixel, depth, picture, BEHIND * scene.size) & opaque).nonzero()[:, 0]
     column, row = pixel[place].long().unbind(-1)
     width, height = video.size
-    texture = torch.from_numpy(np.asarray(opencv().cornerMinEigenVal(_grey(image), 7)))
+    grey = (image.float() @ GREY).round().clamp(0, 255).to(torch.uint8).numpy()
+    texture = torch.from_numpy(np.asarray(opencv().cornerMinEigenVal(grey, 7)))
     score = texture[row, column]
     sharpest = texture.max() if scene.all_move else score.amax() if len(score) else 0.0  # not that of a background
     good = score > QUALITY * sharpest
@@ -306,11 +253,6 @@ def _inside(pixel: Tensor, picture: RenderOutput, there: Tensor) -> Tensor:
     column, row = torch.where(there[:, None], pixel, 0.0).long().unbind(-1)
     inside = there & (least[row, column] >= 0.5)
     return inside if int(inside.sum()) >= THIN * int(there.sum()) else there
-
-
-def _grey(images: Tensor) -> Any:
-    weights = torch.tensor([0.299, 0.587, 0.114])
-    return (images.float() @ weights).round().clamp(0, 255).to(torch.uint8).numpy()
 
 
 def opencv() -> Any:

@@ -12,20 +12,18 @@ from torch import Tensor
 from gaussian_swaying._checks import check_choice
 from gaussian_swaying._fixed import changed
 from gaussian_swaying._live import Live
-from gaussian_swaying.simulation.model import Model, find, names
+from gaussian_swaying.simulation.model import Model, find, flow_of, names
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.wind.field import WindField
 
-Values = Mapping[str, float]
-"""Values of the unknowns, by name."""
-
+Values = Mapping[str, float]  # values of the unknowns, by name
 SCALES = ("log", "linear")
-SCALE, FILM_START = "scene.metres_per_unit", "film.start"
-"""Time in the film at which the motion starts, at rest until then [s]; below 0, the wind has blown for so long when the
-film begins."""
-
-OF_FILM = {FILM_START: Live("s"), SCALE: Live("m", scale="log")}
-"""Unknowns that are no numbers of the simulation."""
+SCALE, FILM_START = "scene.metres_per_unit", "film.start"  # start of the motion [s]; below 0, the wind has blown before
+FLAT = 0.8  # mean square of the area that faces one way, from which the wind may be mirrored
+TURN, MIRROR = 5.0, 20.0  # least angle between wind and mirror image, and largest to another end [degrees]
+LARGE = 0.25  # share of the largest part of a direction below which an unknown is not named
+Direction = tuple[float, list[float], str]  # how strong, its shares of the unknowns, and in words
+OF_FILM = {FILM_START: Live("s"), SCALE: Live("m", scale="log")}  # unknowns that are no numbers of the simulation
 
 
 @dataclass(frozen=True)
@@ -156,15 +154,6 @@ def at_scale(model: Model, metres_per_unit: float) -> Model:
     return replace(found, wind=changed(wind, flows=wind.flows / ratio))
 
 
-LARGE = 0.25
-"""Share of the largest part of a direction below which an unknown is not named."""
-
-
-Direction = tuple[float, list[float], str]
-"""A combination of the unknowns: how many standard deviations the residuals change along it by the whole of the ranges,
-its shares of the unknowns, of length one, and the same in words."""
-
-
 def directions(matrix: Tensor, unknowns: Sequence[Unknown], place: Tensor) -> list[Direction]:
     """The principal directions of the sensitivities J^T W J (U, U) at a place (U,), the best known first."""
     values, vectors = torch.linalg.eigh(matrix)
@@ -221,3 +210,40 @@ def apart_by(unknowns: Sequence[Unknown], one: Sequence[float], other: Sequence[
 def turn(angle: float) -> float:
     """An angle between -180 and 180 degrees."""
     return (angle + 180) % 360 - 180
+
+
+def mirrored_place(model: Model, unknowns: Sequence[Unknown], place: Sequence[float]) -> list[list[float]]:
+    """The place with the mirrored wind, as shares of the ranges; none if there is none within them."""
+    for k, unknown in enumerate(unknowns):
+        if unknown.name == "wind.azimuth" and (azimuth := mirrored(model, values_at(unknowns, place))) is not None:
+            middle = 0.5 * (unknown.low + unknown.high)
+            share = unknown.share(middle + turn(azimuth - middle))
+            return [[*place[:k], share, *place[k + 1 :]]] if 0 <= share <= 1 else []
+    return []
+
+
+def mirrored(model: Model, values: Values) -> float | None:
+    r"""Return the azimuth of the wind mirrored at the normal of a sheet at rest [degrees]; None if nothing is flat.
+
+    The pressure on a sheet with normal n depends on :math:`w \cdot n` and the speed, which the mirror image
+    :math:`2 (w \cdot n) n - w` leaves. Level with the ground, that is the azimuth :math:`2 \beta - \alpha`, with the
+    azimuth :math:`\beta` of n.
+    """
+    patches = model.scene.patches
+    normal = patches.normal.double()[:, :2]
+    weight = patches.area.double() / patches.area.double().sum()
+    shares, axes = torch.linalg.eigh((weight[:, None, None] * normal[:, :, None] * normal[:, None, :]).sum(0).cpu())
+    if not float(shares[-1]) >= FLAT:
+        return None
+    facing = math.degrees(math.atan2(float(axes[1, -1]), float(axes[0, -1])))
+    x, y, _ = flow_of((1.0, 0.0, 0.0), values)
+    azimuth = math.degrees(math.atan2(y, x))
+    other = 2 * facing - azimuth
+    return other if abs(turn(other - azimuth)) >= TURN else None
+
+
+def is_mirrored(model: Model, unknowns: Sequence[Unknown], place: Sequence[float], end: Sequence[float]) -> bool:
+    """True if the wind at the end of another start is about the mirror image of that at a place, both as shares."""
+    values, there = values_at(unknowns, place), values_at(unknowns, end)
+    other = mirrored(model, values) if "wind.azimuth" in values else None
+    return other is not None and abs(turn(there["wind.azimuth"] - other)) < MIRROR

@@ -29,20 +29,11 @@ from gaussian_swaying.geometry.origin import NO_ORIGIN, Origin
 from gaussian_swaying.rendering.cameras.camera import NEAR, Camera, counted_pose
 from gaussian_swaying.rendering.cameras.transforms_json import load_transforms, read_number, read_pose
 
-MOST_FRAMES = 10_000
-"""Most frames of all videos of a fit."""
-
-MOST_BYTES = 2 << 30
-"""Most bytes of their decoded pixels: 345 frames of 1920 x 1080. Reading takes up to twice as much memory."""
-
-CLOSE = 2e-6
-"""Times of frames of several cameras that are the same [s]."""
-
-NARROWEST = 16
-"""Fewest pixels of a frame of a film on its shorter side."""
-
-MOST_PIXELS = 40_000_000
-"""Most pixels of a frame of a film; 8K has 33 million. ffmpeg itself refuses larger ones."""
+MOST_FRAMES = 10_000  # most frames of all videos of a fit
+MOST_BYTES = 2 << 30  # of their pixels: 345 frames of 1920 x 1080
+CLOSE = 2e-6  # times of frames of several cameras that are the same [s]
+NARROWEST = 16  # fewest pixels of a frame of a film on its shorter side
+MOST_PIXELS = 40_000_000  # most pixels of a frame of a film; 8K has 33 million. ffmpeg itself refuses larger ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +62,7 @@ class Footage:
         return found if found < len(self.times) and self.times[found] < time + CLOSE else None
 
 
-Shot = tuple[float, Camera, Tensor]
-"""Time [s], camera and image of a frame."""
+Shot = tuple[float, Camera, Tensor]  # time [s], camera and image of a frame
 
 
 class _Room:
@@ -96,8 +86,7 @@ class _Room:
             )
 
 
-Part = tuple[float, Callable[[_Room], list[Shot]] | Path]
-"""Frames of one camera from a time [s] on, which are not decoded yet; or the picture that does not exist."""
+Part = tuple[float, Callable[[_Room], list[Shot]] | Path]  # frames from a time [s] on; or a missing picture
 
 
 def read_videos(

@@ -1,4 +1,4 @@
-"""The runs of a sweep as WebDataset shards, and as one picture."""
+"""The folder of a sweep: its description, the result of every run, their table, WebDataset shards, and one picture."""
 
 from __future__ import annotations
 
@@ -13,15 +13,133 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gaussian_swaying._checks import check_whole
-from gaussian_swaying._files import atomic
+from gaussian_swaying._files import atomic, remove_temporaries, write_json, write_table
+from gaussian_swaying._inputs import read_json
+from gaussian_swaying.recording.checkpoint import first_change
 from gaussian_swaying.recording.nodes import load_nodes
 from gaussian_swaying.recording.trajectory import load_trajectory
-from gaussian_swaying.sweeps.record import RUNS, read_record, read_result
+from gaussian_swaying.runs.folder import hold_folder
+from gaussian_swaying.runs.lock import FolderLock
+from gaussian_swaying.sweeps.plan import Plan
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
+SWEEP, TABLE, PARQUET = "sweep.json", "sweep.csv", "sweep.parquet"
 SHARDS = "shards"
+PER_SHEET = 200  # runs
+WIDTH, BAND, GAP = 240, 34, 4  # pixels of a picture, of the text below it, and between two
+RUNS, RESULTS, LOGS = "runs", "results", "logs"
+OURS = (SWEEP, TABLE, PARQUET, RUNS, RESULTS, LOGS)
+FIGURES = (
+    *("frames", "substeps", "simulated_s", "particles", "gaussians", "mass_kg", "patch_area_m2"),
+    *("displacement_mean_max_m", "wind_work_J", "largest_cfl", "stretch_min", "stretch_max"),
+    *("lost_particles", "torn_particles"),
+)  # of ``summary.json``, no times of the clock
+ENERGIES = ("kinetic", "elastic", "potential")
+SUMMARY = (*FIGURES, *(f"{name}_end_J" for name in ENERGIES), "warnings")
+
+
+def open_folder(folder: Path, plan: Plan, resume: bool, together: int = 1) -> FolderLock:
+    """Make the folder of a sweep, or check the one that is continued; returns its lock, to be released at the end."""
+    import yaml
+
+    held, foreign = (folder / SWEEP).exists(), [name for name in OURS if os.path.lexists(folder / name)]
+    if resume and not held:
+        raise ValueError(f"There is nothing to resume in {folder}: it has no {SWEEP}; leave out --resume.")
+    if foreign and not resume:
+        what = "holds a sweep already: add --resume to do what is missing in it"
+        what = what if held else f"contains {foreign[0]} of something else"
+        raise ValueError(f"The output folder {folder} {what}: choose another --output.")
+    new: Any = {"made_by": "gaussian_swaying", "format": 1, "frames": plan.frames, "runs": list(map(dict, plan.runs))}
+    new |= {"splats": dict(plan.splats), "config": yaml.safe_load(plan.config)}
+    new = json.loads(json.dumps(new | ({"together": together} if together > 1 else {})))  # as it is read again
+    if held and (old := read_record(folder)) != new:
+        what = f"it has {len(old['runs'])} runs, and now there are {len(new['runs'])}"
+        if len(old["runs"]) == len(new["runs"]):
+            what = first_change(json.dumps(old), json.dumps(new)).removeprefix("`config.")
+            what = f"`{what}" if not what.startswith(("`", "in")) else what
+        remedy = "restore them, or choose another --output."
+        raise ValueError(f"{folder} holds a sweep with other settings ({what}): {remedy}")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"{folder} cannot be written ({error.strerror}): choose another --output.") from error
+    lock = hold_folder(folder, "choose another with --output")
+    try:
+        remove_temporaries(folder)  # of a sweep that was killed while writing
+        if not held:
+            write_json(folder / SWEEP, new)
+        for name in (RUNS, RESULTS, LOGS):
+            (folder / name).mkdir(exist_ok=True)
+    except BaseException:
+        lock.release()
+        raise
+    return lock
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """``sweep.json`` of a folder: the shared configuration, frames, and the value of every axis in each run."""
+    if not (folder / SWEEP).is_file():
+        raise ValueError(f"{folder} is not the folder of a sweep: it has no {SWEEP}; check the path.")
+    record = read_json(folder / SWEEP, "record of the sweep")
+    if not isinstance(record, dict) or not isinstance(record.get("runs"), list) or not record["runs"]:
+        raise ValueError(f"{folder / SWEEP} lists no runs: it is damaged; start the sweep again in another folder.")
+    return record
+
+
+def result_file(folder: Path, name: str) -> Path:
+    """The result of a run."""
+    return folder / RESULTS / f"{name}.json"
+
+
+def read_result(folder: Path, name: str) -> dict[str, Any] | None:
+    """The result of a run; None if it has not ended."""
+    if not (path := result_file(folder, name)).exists():
+        return None
+    try:
+        result = read_json(path, "result")
+        result["status"].lower()
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise ValueError(f"{path} is damaged ({error}): remove it, and --resume does its run again.") from error
+    return dict(result)
+
+
+def result_of(summary: Mapping[str, Any], attempt: int, where: str) -> dict[str, Any]:
+    """The result of a complete run."""
+    figures = {name: summary.get(name) for name in FIGURES}
+    end = summary.get("energy_end_J") or {}
+    figures |= {f"{name}_end_J": end.get(name) for name in ENERGIES}
+    figures["warnings"] = len(summary.get("warnings") or ())
+    result = {"status": summary["status"], "reason": None, "figures": figures, "attempts": attempt, "where": where}
+    return result | {name: summary.get(name) for name in ("wall_s", "peak_memory_bytes")}
+
+
+def write_tables(folder: Path, plan: Plan, results: Mapping[str, Any], parquet: bool = False) -> None:
+    """Write ``sweep.csv``, a row per run in their order; and ``sweep.parquet`` with numbers and lists as such."""
+    rows = []
+    for name, run in zip(plan.names, plan.runs, strict=True):
+        result = results.get(name) or {"status": "missing"}
+        figures = result.get("figures") or {}
+        row: dict[str, Any] = {"run": name, "status": result["status"], "reason": result.get("reason")}
+        rows.append(row | dict(run) | {column: figures.get(column) for column in SUMMARY})
+    write_table(folder / TABLE, [{name: _cell(value) for name, value in row.items()} for row in rows])
+    if parquet:
+        import pyarrow
+        import pyarrow.parquet
+
+        texts = {"status", "reason"}.union(
+            name for row in rows for name, value in row.items() if isinstance(value, dict | str)
+        )
+        columns = {name: [_cell(row[name]) if name in texts else row[name] for row in rows] for name in rows[0]}
+        kinds = {name: pyarrow.string() if name in texts else None for name in columns}
+        with atomic(folder / PARQUET) as temporary:
+            table = {name: pyarrow.array(values, kinds[name]) for name, values in columns.items()}
+            pyarrow.parquet.write_table(pyarrow.table(table), temporary)
+
+
+def _cell(value: Any) -> Any:
+    return value if value is None or isinstance(value, str) else json.dumps(value)
 
 
 def write_shards(
@@ -32,21 +150,13 @@ def write_shards(
     positions: bool = False,
     nodes: bool = False,
 ) -> list[Path]:
-    """Write the complete runs of a sweep as tar files ``000000.tar`` and so on for WebDataset, which must be installed.
+    """Write the complete runs of a sweep as tar files for WebDataset, into ``shards`` or another folder ``output``.
 
-    A sample has
-
-    - ``json``: ``run``, ``settings``, ``summary``, and ``parameter_names`` of
-    - ``parameters.npy``: its values on the axes, float64, shape (A,). A vector takes several places. Axes with text or
-      lists of different lengths are left out.
-    - ``00000.png`` and so on, if wanted: its pictures.
-    - ``positions.npy``, if wanted: positions of its particles [m, z up], float32, shape (T, P, 3).
-    - ``nodes.npy``, if wanted: displacement of the nodes that the Gaussians follow [m, z up], float32, shape (T, N, 3).
-
-    The same runs give the same bytes.
-
-    Args:
-        output: Folder of the files; ``shards`` in the folder of the sweep if None.
+    A sample has ``json`` (``run``, ``settings``, ``summary``, and ``parameter_names``), ``parameters.npy`` (its values
+    on the axes, float64, shape (A,), without text and lists of different lengths), and, if wanted, its pictures
+    ``00000.png`` and so on, ``positions.npy`` of its particles [m, z up], float32, shape (T, P, 3), and ``nodes.npy``,
+    displacement of the nodes that the Gaussians follow [m, z up], float32, shape (T, N, 3). The same runs give the same
+    bytes.
 
     Raises:
         ValueError: If the folder is not a sweep, none of its runs is complete, or something was not recorded.
@@ -110,10 +220,6 @@ def _numbers(value: Any) -> list[float]:
 
 def _pictures(folder: Path, run: str) -> list[Path]:
     return sorted((folder / RUNS / run / "frames").glob("[0-9]*.png"))
-
-
-PER_SHEET = 200  # runs
-WIDTH, BAND, GAP = 240, 34, 4  # pixels of a picture, of the text below it, and between two
 
 
 def write_contact_sheets(folder: Path) -> None:

@@ -9,9 +9,10 @@ import os
 import random
 from argparse import ArgumentError
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gaussian_swaying._checks import check_choice, check_whole
 from gaussian_swaying._files import sha256
@@ -27,10 +28,7 @@ if TYPE_CHECKING:
 MOST_RUNS = 100_000
 FIELDS = ("base", "settings", "axes", "draws", "seed")
 NOT_HERE = ("config", "output", "resume", "device", "preset")
-
-
-Axis = list[Any] | Callable[[random.Random], Any]
-"""The values of an option, which are combined with those of other axes; or a value from a random stream."""
+Axis = list[Any] | Callable[[random.Random], Any]  # the values of an option, or one from a random stream
 
 
 def read_axis(name: str, given: Any) -> Axis:
@@ -94,10 +92,9 @@ def read_axis(name: str, given: Any) -> Axis:
 
 
 def _finite(where: str, value: Any) -> float:
-    try:
+    number = math.nan
+    with suppress(ValueError, TypeError, OverflowError):
         number = math.nan if isinstance(value, bool) else float(value)
-    except (ValueError, TypeError, OverflowError):
-        number = math.nan
     if not math.isfinite(number):
         raise ValueError(f"Expected `{where}` to be a finite number, but got {value!r}: set it.")
     return number
@@ -107,9 +104,6 @@ def runs_of(axes: Mapping[str, Axis], draws: int = 1, seed: int = 0) -> list[dic
     """The settings of every run: all combinations of lists and ranges, the first axis slowest, each drawn some times.
 
     A drawn value is a function of seed, axis and number of the run, so that it stays when other axes change.
-
-    Returns:
-        For each run the value of every axis, in the order of the axes.
 
     Example:
         >>> runs_of({"a": [1, 2], "b": [3, 4]})
@@ -131,19 +125,12 @@ def runs_of(axes: Mapping[str, Axis], draws: int = 1, seed: int = 0) -> list[dic
     return runs
 
 
-@dataclass(frozen=True)
-class Sweep:
-    """A sweep file as it is written.
-
-    Args:
-        base: Configuration files of ``sim``; later ones override earlier ones.
-        runs: The value of every axis in each run, see :func:`~gaussian_swaying.sweeps.plan.runs_of`.
-        settings: Options of ``sim`` for all runs, by their names on the command line.
-    """
+class Sweep(NamedTuple):
+    """A sweep file: configurations of ``sim``, the value of every axis in each run, and options of all runs."""
 
     base: Sequence[str]
     runs: Sequence[Mapping[str, Any]]
-    settings: Mapping[str, Any] = field(default_factory=dict)
+    settings: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -169,12 +156,7 @@ class Plan:
 
 
 def read_sweep(path: str | os.PathLike[str], find: Callable[[str], str] = str) -> Sweep:
-    """Read a sweep file.
-
-    Args:
-        path: YAML with ``base``, ``axes`` and, if needed, ``settings``, ``draws`` and ``seed``; docs/many.md describes
-            them.
-    """
+    """Read a sweep file, which docs/many.md describes; ``find`` gives the file of a name in ``base``."""
     file = Path(path)
     given = read_fields(file, "the sweep file", FIELDS)
     base = given.get("base")
@@ -200,13 +182,9 @@ def read_sweep(path: str | os.PathLike[str], find: Callable[[str], str] = str) -
 
 
 def make_plan(sweep: Sweep, parser: ArgumentParser | None = None) -> Plan:
-    """Check the settings of a sweep: the base, and every value of every axis.
+    """Check the settings of a sweep as ``sim`` does: the base, and every value of every axis.
 
-    Values are parsed as ``sim`` does. What a run can only find out when it begins (a pin that holds nothing, a file
-    that is damaged) is reported by that run.
-
-    Args:
-        parser: From :meth:`Simulation.parser`; made here if None.
+    What a run can only find out when it begins (a pin that holds nothing, a damaged file) is reported by that run.
     """
     parser = parser or Simulation.parser()
     files = [word for name in sweep.base for word in ("--config", name)]
@@ -237,10 +215,7 @@ def parse_run(parser: ArgumentParser, config: str, frames: int, run: Mapping[str
 
 
 def _telling(runs: Sequence[Mapping[str, Any]]) -> list[int]:
-    """The runs in which a value appears for the first time; of axes with a number in every run, the first one.
-
-    Those are seeds and draws, all alike: with more than a hundred of them, to check each would take long.
-    """
+    """The runs in which a value appears for the first time; of more than a hundred seeds or draws, the first."""
     many = {name: len({json.dumps(run[name]) for run in runs}) == len(runs) > 100 for name in runs[0]}
     seen: set[tuple[str, str]] = set()
     numbers = []

@@ -36,18 +36,17 @@ from gaussian_swaying.runs.signals import stop_signals
 from gaussian_swaying.simulation.measure import SimulationDiverged
 from gaussian_swaying.simulation.model import POLAR, find, number
 from gaussian_swaying.simulation.simulation import Simulation, run_batch
-from gaussian_swaying.sweeps.dataset import write_contact_sheets
-from gaussian_swaying.sweeps.plan import Plan, parse_run
-from gaussian_swaying.sweeps.record import (
+from gaussian_swaying.sweeps.dataset import (
     LOGS,
     RUNS,
-    failure,
     open_folder,
     read_result,
     result_file,
     result_of,
+    write_contact_sheets,
     write_tables,
 )
+from gaussian_swaying.sweeps.plan import Plan, parse_run
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser
@@ -59,16 +58,12 @@ LOCAL = "local"
 Explain = Callable[[BaseException], str]
 
 
-# ---- one job, in a worker
 @dataclass(frozen=True)
 class Job:
     """A run to do, or several of equal shape that are simulated together.
 
-    Args:
-        config: Configuration that all runs share, as YAML.
-        runs: The value of every axis in each run.
-        resume: Continue from the checkpoint of an earlier attempt, if there is one; not if there are several runs.
-        complete: Names of runs that are done already, and only simulated along with the others.
+    ``config`` is the YAML that they share, ``runs`` have the values of the axes; runs that are ``complete`` are only
+    simulated along. A single run continues from a checkpoint if it is to ``resume``.
     """
 
     folder: Path
@@ -85,6 +80,9 @@ class Job:
     def wanted(self) -> tuple[str, ...]:
         return tuple(name for name in self.names if name not in self.complete)
 
+    def failure(self, status: str, reason: str) -> dict[str, Any]:
+        return {"status": status, "reason": reason, "attempts": self.attempt}
+
     def apart(self) -> list[Job]:
         pairs = zip(self.names, self.runs, strict=True)
         return [replace(self, names=(n,), runs=(r,), attempt=1) for n, r in pairs if n not in self.complete]
@@ -92,16 +90,11 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The result of each run of a job by name.
-
-    Attributes:
-        killed: Whether its process was killed, so that the reason may be outside of it.
-        ready: Whether its process can do another job. It should not after lack of memory, a bug or a signal.
-    """
+    """The result of each run of a job by name."""
 
     results: dict[str, dict[str, Any]] = field(default_factory=dict)
-    killed: bool = False
-    ready: bool = True
+    killed: bool = False  # its process, so that the reason may be outside of it
+    ready: bool = True  # for another job; not after lack of memory, a bug or a signal
 
 
 @cache
@@ -112,11 +105,7 @@ def _parser() -> ArgumentParser:
 
 
 def work(job: Job, threads: int, explain: Explain, where: str = platform.node()) -> Outcome:
-    """Do a job in a worker and write the results of its complete runs; the caller writes those of failures.
-
-    Args:
-        explain: Makes a sentence of an error; a function of a module.
-    """
+    """Do a job in a worker and write the results of its complete runs; the caller writes those of failures."""
     torch.set_num_threads(threads)
     told = io.StringIO()
     results, status, ready = dict[str, dict[str, Any]](), "failed", True
@@ -140,15 +129,14 @@ def work(job: Job, threads: int, explain: Explain, where: str = platform.node())
             if told.getvalue():
                 with (job.folder / LOGS / f"{job.names[0]}.txt").open("a", encoding="utf-8") as file:
                     file.write(told.getvalue())
-    return Outcome({name: failure(status, reason, job.attempt) for name in job.wanted}, ready=ready)
+    return Outcome(dict.fromkeys(job.wanted, job.failure(status, reason)), ready=ready)
 
 
 def _lost(job: Job, reason: str) -> Outcome:
     """The outcome of a job whose process was killed, maybe after its last step."""
-    lost = {name: failure("failed", reason, job.attempt) for name in job.wanted}
-    written = {name: read_result(job.folder, name) or {"status": "none"} for name in job.wanted}
-    done = {name: result for name, result in written.items() if result["status"] == "complete"}
-    return Outcome(lost | done, killed=True, ready=False)
+    lost, done = job.failure("failed", reason), {name: read_result(job.folder, name) for name in job.wanted}
+    found = {name: own if own and own["status"] == "complete" else lost for name, own in done.items()}
+    return Outcome(found, killed=True, ready=False)
 
 
 def _unlocked(do: Callable[[], Any]) -> Any:
@@ -162,14 +150,16 @@ def _unlocked(do: Callable[[], Any]) -> Any:
             time.sleep(0.5)
 
 
+def _first_of(job: Job) -> Simulation:
+    settings = parse_run(_parser(), job.config, job.frames, job.runs[0])
+    settings.device = job.device
+    return Simulation.from_settings(_parser(), settings)
+
+
 def run_alone(job: Job) -> dict[str, dict[str, Any]]:
     """Do the only run of a job; returns its summary by name."""
     (name,), (run,) = job.names, job.runs
-    settings = parse_run(_parser(), job.config, job.frames, run)
-    settings.device = job.device
-    folder = job.folder / RUNS / name
-    extra = {"sweep": {"run": name, "settings": run}}
-    simulation = Simulation.from_settings(_parser(), settings)
+    folder, extra, simulation = job.folder / RUNS / name, {"sweep": {"run": name, "settings": run}}, _first_of(job)
 
     def once() -> dict[str, Any]:
         if job.resume and (folder / "checkpoint.pt").exists():
@@ -191,9 +181,7 @@ def shares_rollout(name: str) -> bool:
 
 
 def grouped(runs: Sequence[Mapping[str, Any]], size: int) -> list[list[int]]:
-    """Numbers of the runs that are simulated together, at most ``size`` of them.
-
-    It depends on nothing but the runs and the size, so that a sweep that is resumed has the same groups.
+    """Numbers of the runs that are simulated together, at most ``size`` of them; the same in a sweep that is resumed.
 
     Example:
         >>> grouped([{"wind.seed": 1, "solver.dx": x} for x in (1, 2, 1, 1)], 2)
@@ -219,9 +207,7 @@ def members_of(job: Job) -> list[Simulation]:
     """Simulations of all runs of a job; only the first is parsed, as that takes longer than a frame."""
     import yaml
 
-    settings = parse_run(_parser(), job.config, job.frames, job.runs[0])
-    settings.device = job.device
-    first = Simulation.from_settings(_parser(), settings)
+    first = _first_of(job)
     first.start()  # with all checks of a run
     content, members = yaml.safe_load(first.config), [first]
     for run in job.runs[1:]:
@@ -234,14 +220,10 @@ def members_of(job: Job) -> list[Simulation]:
     return members
 
 
-# ---- processes
 class Processes:
-    """Does jobs in loky's processes on this machine, several at a time; it knows nothing of plans, retries and tables.
+    """Does jobs in loky's processes on this machine, which take the GPUs in turn.
 
     Each has an executor of its own: loky ends all processes of an executor if one of them is killed.
-
-    Args:
-        gpus: The GPUs as in ``CUDA_VISIBLE_DEVICES``; the workers take them in turn.
     """
 
     def __init__(self, workers: int, threads: int, explain: Explain = first_line, gpus: Sequence[str] = ()) -> None:
@@ -326,20 +308,12 @@ def _without_ctrl_c() -> Iterator[None]:
 
 
 class Ray:
-    """Does jobs as Ray tasks, as :class:`Processes` does.
+    """Does jobs as Ray tasks, as :class:`Processes` does, as many as there is room for if ``workers`` is None.
 
     All machines must have this package, and see the folder of the sweep and the splats under the same paths.
-
-    Args:
-        address: Of a cluster, as for ``ray.init``; ``local`` starts Ray on this machine.
-        workers: Jobs at a time; as many as the cluster has room for if None.
-        threads: Threads of each job, which Ray counts as CPUs.
-        gpu: The share of a GPU that a job takes.
     """
 
-    def __init__(
-        self, address: str, workers: int | None, threads: int, explain: Explain = first_line, gpu: float = 0.0
-    ) -> None:
+    def __init__(self, address: str, workers: int | None, threads: int, explain: Explain, gpu: float) -> None:
         import ray
 
         self._ray: Any = ray
@@ -395,18 +369,13 @@ def _task(job: Job, threads: int, explain: Explain, folder: str, path: list[str]
     return done
 
 
-# ---- all jobs
 def drive(
     jobs: Sequence[Job], pool: Processes | Ray, ended: Callable[[str, dict[str, Any]], None], retries: int = 1
 ) -> None:
     """Run jobs: a failed one is tried again, and one that fails too often does not stop the rest.
 
-    A job of several runs that fails is done again run by run. If this is interrupted (Ctrl-C, or an exception of a
-    callback), the runs are ended in order.
-
-    Args:
-        ended: Called with the name and the result of each run, in the order in which they end.
-        retries: Number of times that a failed job is tried again; three times as often if its process was killed.
+    A job of several runs that fails is done again run by run. ``ended`` gets the name and the result of each run; if
+    this is interrupted, they are ended in order.
     """
     waiting, running = deque(jobs), dict[Future[Outcome], Job]()
     try:
@@ -433,14 +402,6 @@ def drive(
     pool.close()
 
 
-def gpus_for(device: str) -> list[str]:
-    """The GPUs for runs on ``auto``, ``cpu`` or ``cuda``, as in ``CUDA_VISIBLE_DEVICES``; none on a CPU."""
-    if device == "cpu" or not torch.cuda.is_available():
-        return []
-    named = [name.strip() for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name.strip()]
-    return named[: torch.cuda.device_count()] or [str(place) for place in range(torch.cuda.device_count())]
-
-
 def run_sweep(
     plan: Plan,
     output: str | os.PathLike[str],
@@ -461,9 +422,7 @@ def run_sweep(
         workers: Runs at a time; None for one on each GPU, or core.
         threads: Threads of each; None for its share of the cores.
         retries: Number of times that a failed run is tried again; three times as often if its process was killed.
-        device: ``auto``, ``cpu`` or ``cuda``, for every run.
         explain: Makes a sentence of an error of a run; a function of a module.
-        progress: Show a bar of runs, and a line for each failure.
         together: Largest number of runs of equal shape that are simulated together, as one job.
         ray: Address of a Ray cluster, or ``local`` to start Ray here; None for processes of this machine.
 
@@ -472,14 +431,17 @@ def run_sweep(
     """
     folder = Path(output).absolute()
     check_choice("device", device, ("auto", "cpu", "cuda"))
-    for name, count in (("workers", workers), ("threads", threads), ("together", together)):
-        if count is not None:
-            check_whole(name, count, 1)
-    check_whole("retries", retries, 0)
-    if ray is not None:
-        check_extra("ray", "ray", "ray")
-    if parquet:
-        check_extra("parquet", "pyarrow", "parquet")
+    for name, given, least in (
+        ("workers", workers, 1),
+        ("threads", threads, 1),
+        ("together", together, 1),
+        ("retries", retries, 0),
+    ):
+        if given is not None:
+            check_whole(name, given, least)
+    for option, module, wanted in (("ray", "ray", ray is not None), ("parquet", "pyarrow", parquet)):
+        if wanted:
+            check_extra(option, module)
     lock = open_folder(folder, plan, resume, together)
     try:
         results = {name: result for name in plan.names if (result := read_result(folder, name)) is not None}
@@ -501,7 +463,9 @@ def run_sweep(
                     tqdm.write(f"run {name} {result['status']}: {result['reason']}", file=sys.stderr)
             bar.update()
 
-        gpus = gpus_for(device)
+        count = 0 if device == "cpu" else torch.cuda.device_count()
+        named = [name.strip() for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name.strip()]
+        gpus = named[:count] or [str(place) for place in range(count)]
         try:
             if jobs and ray is not None:
                 share = min(1.0, len(gpus) / (workers or 1)) or float(device == "cuda")
@@ -522,7 +486,8 @@ def run_sweep(
         lock.release()
 
 
-def check_extra(option: str, module: str, extra: str) -> None:
+def check_extra(option: str, module: str) -> None:
     """Raise ValueError if an option of the command needs a module that is not installed."""
     if find_spec(module) is None:
+        extra = module.replace("pyarrow", "parquet")
         raise ValueError(f"`--{option}` needs {module}: install gaussian-swaying[{extra}], or leave it out.")

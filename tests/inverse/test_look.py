@@ -10,7 +10,7 @@ from shared import value_error
 from small_films import changed
 
 from gaussian_swaying.inverse.fit import Problem, fit
-from gaussian_swaying.inverse.look import FOUND, first_look, shown_in
+from gaussian_swaying.inverse.registration import FOUND, first_look, shown_in
 from gaussian_swaying.inverse.videos import read_videos
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")

@@ -10,16 +10,14 @@ from shared import rows, value_error
 from gaussian_swaying.cli.sweep import main
 from gaussian_swaying.recording.nodes import load_nodes
 from gaussian_swaying.recording.trajectory import load_trajectory
-from gaussian_swaying.sweeps import record
-from gaussian_swaying.sweeps.dataset import write_shards
+from gaussian_swaying.sweeps.dataset import SUMMARY, write_shards, write_tables
 from gaussian_swaying.sweeps.plan import Plan
-from gaussian_swaying.sweeps.record import write_tables
 
 
 def test_parquet(tmp_path):
     parquet = pytest.importorskip("pyarrow.parquet")
     runs = [{"wind.flow": [k, 0.5, 0], "material.E": 1e3, "wind.seed": k, "law": {"a": k}} for k in range(3)]
-    figures = {name: None for name in record.SUMMARY} | {"frames": 5, "substeps": 7.0, "warnings": 0}
+    figures = {name: None for name in SUMMARY} | {"frames": 5, "substeps": 7.0, "warnings": 0}
     results = {"00000": {"status": "complete", "reason": None, "figures": figures}}
     results["00001"] = {"status": "failed", "reason": "It broke."}
     write_tables(tmp_path, Plan("", 5, tuple(runs), {}), results, parquet=True)
