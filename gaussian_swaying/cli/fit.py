@@ -12,7 +12,7 @@ from typing import Any
 
 from gaussian_swaying import _program as program
 from gaussian_swaying.cli.errors import DEVICE, guessing, run_command
-from gaussian_swaying.cli.preview import joined, up_of
+from gaussian_swaying.cli.preview import joined
 from gaussian_swaying.cli.shipped import with_shipped
 from gaussian_swaying.runs.signals import stop_signals
 from gaussian_swaying.simulation.simulation import Simulation
@@ -72,10 +72,9 @@ def fit(options: argparse.Namespace, begun: list[str]) -> int:
             folder = Path(options.output or Path("outputs") / "fits" / file.stem)
         else:
             whole = Path(options.output or Path("outputs") / "fits" / Path(options.film).stem)
-            up = None if options.up is None else up_of(options.up)
-            given: dict[str, Any] = {name: getattr(options, name) for name in ("hold", "focal", "device")}
+            given: dict[str, Any] = {name: getattr(options, name) for name in ("up", "hold", "focal", "device")}
             folder, length = whole / RESULT, _length(options.length)
-            file = prepare(options.film, options.splat, whole, length=length, up=up, **given)
+            file = prepare(options.film, options.splat, whole, length=length, **given)
             print(f"wrote {file}", flush=True)
         again = program.command("fit", "--config", options.config or file, "--output", folder)
         plan = read_plan(file, lambda name: with_shipped(["--config", name], "sim")[1])

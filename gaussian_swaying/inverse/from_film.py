@@ -51,6 +51,7 @@ from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.suggestion.starter import keep_aside, write_starter
 from gaussian_swaying.suggestion.suggest import suggest
 from gaussian_swaying.suggestion.suggestion import Suggestion
+from gaussian_swaying.suggestion.up import given_up
 
 PLAN, LOOK, RESULT = "fit.yaml", "preview", "result"
 SECONDS, LEAD = 1.5, 0.4  # time of motion that is fitted, and time at rest that is kept before it [s]
@@ -134,7 +135,7 @@ def prepare(
         given_hold(hold, (0.0, 0.0, 1.0))  # refuses what is no end
     if Path(film).suffix.lower() in STILLS:
         raise ValueError(f"{film} is a picture: give a film, or find its camera with `camera`.")
-    axis, folder = None if up is None else direction(up), Path(output)
+    axis, folder = None if up is None else given_up(up).direction, Path(output)
     seen, told = registered(film, splat, axis, focal)
     say(told)
     folder.mkdir(parents=True, exist_ok=True)
@@ -202,15 +203,6 @@ def registered(
         f"{source} ({fov_of(found.camera):.0f} degrees from top to bottom)"
     )
     return Seen(head, frame, cloud, found.camera, picture, found.residual), told
-
-
-def direction(up: str | Sequence[float]) -> list[float]:
-    """The direction of ``up``, shape (3,)."""
-    found = list(DIRECTIONS.get(up, ())) if isinstance(up, str) else list(up)
-    if len(found) != 3 or not any(found):
-        told = up if isinstance(up, str) else " ".join(f"{part:g}" for part in up)
-        raise ValueError(f"Expected `--up` to be {', '.join(DIRECTIONS)} or 3 numbers, but got {told}.")
-    return found
 
 
 def _background(seen: Seen) -> list[float]:

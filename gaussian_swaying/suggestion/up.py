@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -113,13 +114,14 @@ def guess_up(splat: Gaussians) -> tuple[Guess, Array]:
     return Guess(best, DIRECTIONS[best], confidence, tuple(why), scores, (best, other)), floors[best]
 
 
-def given_up(up: Sequence[float] | str) -> Guess:
-    """A given up direction, as 3 numbers or as ``+x`` to ``-z``."""
-    if isinstance(up, str):
-        if up not in DIRECTIONS:
-            raise ValueError(f"Expected `--up` to be {', '.join(DIRECTIONS)} or 3 numbers, but got {up!r}.")
-        up = DIRECTIONS[up]
-    direction = check_vector("--up", up)
+def given_up(up: str | Sequence[float] | Sequence[str]) -> Guess:
+    """A given up direction: 3 numbers or ``+x`` to ``-z``, also as words of a command line."""
+    words: list[Any] = [up] if isinstance(up, str) else list(up)
+    told = " ".join(word if isinstance(word, str) else f"{word:g}" for word in words)
+    try:
+        direction = check_vector("--up", DIRECTIONS.get(told) or [float(word) for word in words])
+    except ValueError:
+        raise ValueError(f"Expected `--up` to be {', '.join(DIRECTIONS)} or 3 numbers, but got {told}.") from None
     length = math.hypot(*direction)
     if length == 0:
         raise ValueError("Expected `--up` to be a direction, for example 0 -1 0, but got zero.")

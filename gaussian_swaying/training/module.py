@@ -40,13 +40,7 @@ class SplatParallel(DDPStrategy):
 
 
 class TrainingDiverged(RuntimeError):  # noqa: N818
-    """A loss or a Gaussian is no longer finite; the message names the step and the last good checkpoint.
-
-    Args:
-        step: Number of images trained on before the one that failed.
-        what: Name of the value that is not finite.
-        checkpoint: Last checkpoint written before, if any.
-    """
+    """A loss or a Gaussian is no longer finite after so many images; the last checkpoint, if any, is named."""
 
     def __init__(self, step: int, what: str, checkpoint: str | None = None) -> None:
         self.step, self.checkpoint = step, checkpoint
@@ -143,8 +137,6 @@ class SplatTrainer(lightning.LightningModule):
 
     fixed_background: Tensor
 
-    # ---- what is trained
-
     @property
     def splat(self) -> GaussianSurfaceModel:
         """The Gaussians; RuntimeError before there are any."""
@@ -199,26 +191,16 @@ class SplatTrainer(lightning.LightningModule):
         """Number of devices that train together; a step takes so many images."""
         return self.trainer.world_size
 
-    # ---- a step
-
     def active_degree(self, step: int) -> int:
         """Degree of the harmonics in use at a step."""
         return self.sh_degree if self.sh_every == 0 else min(step // self.sh_every, self.sh_degree)
 
     def render(
-        self,
-        camera: Camera,
-        background: Tensor | None = None,
-        degree: int | None = None,
-        surface: bool = False,
+        self, camera: Camera, background: Tensor | None = None, degree: int | None = None, surface: bool = False
     ) -> SplatOutput:
-        """Draw the Gaussians.
+        """Draw the Gaussians over a colour (3,), black if None, with some ``degree`` of the harmonics, all if None.
 
-        Args:
-            camera: The camera.
-            background: Colour behind them, shape (3,); black when None.
-            degree: Degree of the harmonics in use; all when None.
-            surface: Whether to blend the channels that :func:`~gaussian_swaying.rendering.planes.surface_maps` needs.
+        With ``surface``, also the channels that :func:`~gaussian_swaying.rendering.planes.surface_maps` needs.
         """
         splat = self.splat
         degree = self.sh_degree if degree is None else degree
@@ -340,8 +322,6 @@ class SplatTrainer(lightning.LightningModule):
         for logger in self.trainer.loggers:  # not self.log, which would write them again at every step
             logger.log_metrics({f"train/{name}": float(value) for name, value in values.items()}, self.global_step)
 
-    # ---- checkpoints
-
     def last_checkpoint(self) -> str | None:
         """The newest checkpoint of this run, or the one that it resumes; None if there is none."""
         resumed = self.trainer.ckpt_path
@@ -398,20 +378,16 @@ class SplatTrainer(lightning.LightningModule):
         else:
             warnings.warn(f"The checkpoint was trained with {stored['kind']}, so its state is not used.", stacklevel=2)
 
-    # ---- evaluation
-
     def validation_step(self, batch: Mapping[str, Any], batch_idx: int) -> None:
-        """Metrics of one image, and its panel."""
         self._evaluate(batch, batch_idx, "val")
 
     def test_step(self, batch: Mapping[str, Any], batch_idx: int) -> None:
-        """Metrics of one image, and its panel."""
         self._evaluate(batch, batch_idx, "test")
 
     def _evaluate(self, batch: Mapping[str, Any], batch_idx: int, stage: str) -> None:
         target, _, background = self._target(batch, train=False)
         images = self.global_step * self.devices if self._fitting else self._seen
-        degree = self.active_degree(max(images - 1, 0)) if self._fitting else self._degree_reached()
+        degree = self.active_degree(max(images - 1, 0)) if self._fitting or images else self.sh_degree
         image = self.render(batch["camera"], background, degree).color.clamp(0.0, 1.0)
         for name, value in picture_metrics(image, target).items():
             self.log(f"{stage}/{name}", value, prog_bar=name == "psnr", batch_size=1)
@@ -421,25 +397,13 @@ class SplatTrainer(lightning.LightningModule):
             folder = Path(self.trainer.default_root_dir) / "panels"
             write_panel(pictures, folder, f"{stage}_{batch_idx:02d}", images, self.trainer.loggers)
 
-    def _degree_reached(self) -> int:
-        return self.sh_degree if self._seen == 0 else self.active_degree(self._seen - 1)
-
-    # ---- the end
-
     def on_train_end(self) -> None:
         """Write ``point_cloud.ply``."""
         if self.trainer.is_global_zero:
             self.export(Path(self.trainer.default_root_dir) / "point_cloud.ply")
 
     def export(self, path: str | os.PathLike[str]) -> None:
-        """Write the Gaussians as a 3DGS file, without those that are not finite.
-
-        Args:
-            path: File to write; its folder is made.
-
-        Raises:
-            ValueError: If none is finite.
-        """
+        """Write the Gaussians as a 3DGS file, without those that are not finite; ValueError if none is."""
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         cloud = self.splat.to_cloud()
         values = (cloud.means, cloud.quats, cloud.scales, cloud.opacities[:, None], cloud.sh.flatten(1))

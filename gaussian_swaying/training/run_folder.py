@@ -27,11 +27,8 @@ def default_loggers(folder: Path) -> list[Logger]:
 class RunFolder(Callback):
     """Locks the folder of a training run, moves an earlier run in it aside, and writes a checkpoint at the end.
 
-    Attributes:
-        loggers: Whether to make :func:`default_loggers` in the folder then; Lightning's would be made before.
-        save_config: Function that writes the configuration to a folder.
-        begun: Whether the folder was taken.
-        newest: Gives the last checkpoint of the run that has begun, or the one that it resumed.
+    ``begun`` once the folder was taken; then ``newest`` gives the last checkpoint, and if there are to be ``loggers``,
+    :func:`default_loggers` are made.
     """
 
     def __init__(self) -> None:

@@ -27,16 +27,9 @@ from gaussian_swaying.training.parallel import this_device
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainingImage:
-    """One batch: an image and the camera that took it.
+    """One batch: the bytes of an image, (H, W, 3), or (H, W, 4) with premultiplied alpha, and the camera that took it.
 
-    It stores bytes and computes colours where they are used, so that little is copied to a GPU. Fields and properties
-    are also available as items: ``batch["image"]``.
-
-    Attributes:
-        pixels: Dtype uint8, shape (H, W, 3), or (H, W, 4) with premultiplied alpha.
-        camera: Camera of the image.
-        name: Path of the image as written in the capture's files.
-        index: Index of the view in ``Capture.split(...)``.
+    ``index`` is that of the view in ``Capture.split(...)``. Fields and properties are also items: ``batch["image"]``.
     """
 
     pixels: Tensor
@@ -78,16 +71,7 @@ class TrainingImage:
 
 
 class CaptureDataset(Dataset[TrainingImage]):
-    """Views of one split.
-
-    Args:
-        views: The views.
-        cache: Keep the pixels in memory, as bytes in the size of the views; page-locked if there is a GPU.
-        threads: Threads that read images into the cache.
-
-    Raises:
-        ValueError: If an image cannot be read into the cache.
-    """
+    """Views of one split; some threads read them into a cache of bytes, page-locked if there is a GPU."""
 
     def __init__(self, views: tuple[View, ...], cache: bool = True, threads: int = 4) -> None:
         self.views = views
@@ -190,23 +174,14 @@ class CaptureDataModule(LightningDataModule):
 
     @property
     def scene_scale(self) -> float:
-        """``extent`` of the capture [scene units]."""
         return self.capture.extent
 
     @property
     def origin(self) -> Origin:
-        """``origin`` of the capture."""
         return self.capture.origin
 
     def initial_cloud(self, sh_degree: int = 3) -> GaussianCloud:
-        """The initial Gaussians.
-
-        Args:
-            sh_degree: Degree of their spherical harmonics.
-
-        Raises:
-            ValueError: If this capture cannot provide ``points``.
-        """
+        """The initial Gaussians; ValueError if this capture cannot provide ``points``."""
         cloud = initial_points(self.capture, self.points, self.point_count, self.seed)
         settings = (sh_degree, self.initial_opacity, self.initial_scale)
         return replace(gaussians_from_points(cloud.points, cloud.colors, *settings), origin=self.origin)
@@ -217,14 +192,7 @@ class CaptureDataModule(LightningDataModule):
         return "val" if self.capture.split("val") else "test"
 
     def setup(self, stage: str | None = None) -> None:
-        """Read the capture, and the images of the stage into the cache.
-
-        Args:
-            stage: ``fit``, ``validate``, ``test``, or None for all.
-
-        Raises:
-            ValueError: If the capture or one of these images is bad.
-        """
+        """Read the capture, and the images of the stage into the cache; ValueError if they are bad."""
         if self.trainer is None or self.trainer.is_global_zero:
             print(self.capture.found)
         wanted = {"fit": ("train", self.validation_split), "validate": (self.validation_split,), "test": ("test",)}
@@ -242,13 +210,8 @@ class CaptureDataModule(LightningDataModule):
         return self._datasets[split]
 
     def _options(self) -> dict[str, Any]:
-        workers = 0 if self.cache else self.workers
-        return {
-            "batch_size": None,  # each item is a batch
-            "num_workers": workers,
-            "persistent_workers": workers > 0,
-            "pin_memory": torch.cuda.is_available() and not self.cache,
-        }
+        workers, pin = 0 if self.cache else self.workers, torch.cuda.is_available() and not self.cache
+        return {"batch_size": None, "num_workers": workers, "persistent_workers": workers > 0, "pin_memory": pin}
 
     def transfer_batch_to_device(
         self, batch: TrainingImage, device: torch.device, dataloader_idx: int
@@ -257,7 +220,6 @@ class CaptureDataModule(LightningDataModule):
         return batch.to(device, non_blocking=True)
 
     def train_dataloader(self) -> DataLoader[TrainingImage]:
-        """Training images, shuffled and endless."""
         dataset = self._dataset("train")
         rank, devices = this_device()
         seen = 0 if self.trainer is None else self.trainer.global_step * devices
@@ -279,15 +241,7 @@ class CaptureDataModule(LightningDataModule):
                 )
 
     def other_view(self, index: int, pick: float) -> TrainingImage | None:
-        """A training image that shows the same place as another one, for losses that compare two views.
-
-        Args:
-            index: Index of the training image.
-            pick: Which of its neighbours, as a number from 0 to 1 (excluded).
-
-        Returns:
-            The image, or None if no other view is close enough.
-        """
+        """A training image of the same place as another one, ``pick`` of its neighbours, 0 to 1; None if none."""
         dataset = self._dataset("train")
         if self._others is None:
             cameras = [view.camera for view in dataset.views]
@@ -296,24 +250,17 @@ class CaptureDataModule(LightningDataModule):
         return dataset[others[int(pick * len(others))]] if others else None
 
     def val_dataloader(self) -> DataLoader[TrainingImage]:
-        """Validation images in order."""
         return DataLoader(self._dataset(self.validation_split), shuffle=False, **self._options())
 
     def test_dataloader(self) -> DataLoader[TrainingImage]:
-        """Test images in order."""
         return DataLoader(self._dataset("test"), shuffle=False, **self._options())
 
 
 class EndlessShuffle(Sampler[int]):
     """Endless indices of ``count`` images: each round is a permutation given by the seed and the number of the round.
 
-    A run that continues after ``start`` images gets exactly the same images as one without a stop.
-
-    Args:
-        count: Number of images.
-        seed: Seed of the permutations.
-        start: Number of images already seen.
-        every: Take only every so many of them, from ``start`` on: the share of one of several devices.
+    A run that continues after ``start`` images gets exactly the same images as one without a stop. One of several
+    devices takes ``every`` so many of them.
 
     Raises:
         ValueError: If there is no image, or ``start`` is negative.

@@ -35,11 +35,7 @@ class GeneratedDataModule(CaptureDataModule):
         self.generated = capture
 
     def setup(self, stage: str | None = None) -> None:
-        """Draw the images if they do not exist yet, then read them.
-
-        Args:
-            stage: ``fit``, ``validate``, ``test``, or None for all.
-        """
+        """Draw the images if they do not exist yet, then read them."""
         self._make()
         super().setup(stage)
 
