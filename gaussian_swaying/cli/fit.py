@@ -72,9 +72,9 @@ def fit(options: argparse.Namespace, begun: list[str]) -> int:
             folder = Path(options.output or Path("outputs") / "fits" / file.stem)
         else:
             whole = Path(options.output or Path("outputs") / "fits" / Path(options.film).stem)
-            given: dict[str, Any] = {name: getattr(options, name) for name in ("up", "hold", "focal", "device")}
+            given = [getattr(options, name) for name in ("up", "hold", "focal", "device")]
             folder, length = whole / RESULT, _length(options.length)
-            file = prepare(options.film, options.splat, whole, length=length, **given)
+            file = prepare(options.film, options.splat, whole, length, *given)
             print(f"wrote {file}", flush=True)
         again = program.command("fit", "--config", options.config or file, "--output", folder)
         plan = read_plan(file, lambda name: with_shipped(["--config", name], "sim")[1])

@@ -26,15 +26,10 @@ HELD, LEAST_HELD = 7, 6  # one of so many tracks is not fitted, if there are at 
 
 
 class Evidence:
-    """What one camera shows: positions of Gaussians in the simulation are compared with those followed in its video.
+    """Where Gaussians of a simulation are, beside where they were followed in the video of a camera.
 
-    A camera that sees a surface edge-on hardly tells where its points are: residuals are multiplied by :func:`facing`.
-
-    Args:
-        trust: What else each residual is multiplied by, shape (F, T); None for 1.
-
-    Attributes:
-        rest: Places of the Gaussians at rest [scene units], on the CPU, shape (T, 3).
+    Residuals are multiplied by :func:`facing`, as a camera hardly tells what it sees edge-on, and by ``trust`` (F, T).
+    ``rest`` are the places at rest [scene units], on the CPU, shape (T, 3).
     """
 
     def __init__(self, simulation: Simulation, video: Footage, tracks: Tracks, trust: Tensor | None = None) -> None:
@@ -76,9 +71,9 @@ def compare(
     moving: bool = False,
     tick: Callable[[int], object] = int,
 ) -> Block:
-    """Simulate variants, and compare each with the videos at some times [s], ascending.
+    """Simulate variants, with the same substeps unless one diverges, and compare each with the videos at times [s].
 
-    All take the same substeps, unless one of them diverges. The first frame is compared if the videos begin in motion.
+    The first frame is compared if the videos begin in motion.
     """
     wanted = [(time, [(0, time)] if time > 0 or moving else []) for time in times]  # at rest all variants are alike
     try:
@@ -95,9 +90,9 @@ def compare_starts(
     starts: Sequence[float],
     tick: Callable[[int], object] = int,
 ) -> list[Block]:
-    """Compare variants as if each had begun to move at each of some times of the film, from one simulation of each.
+    """Residuals of variants as if they had begun to move at each of some times, from one simulation of each.
 
-    For each of these, in a wind that does not depend on time, the residuals of all variants, also of the first frame.
+    The wind must not depend on time.
     """
     wanted: dict[int, list[tuple[int, float]]] = {}  # what is compared with a state, by its time [microseconds]
     for number, start in enumerate(starts):
@@ -117,7 +112,6 @@ def _compared(
     careful: bool,
     tick: Callable[[int], object],
 ) -> list[Block]:
-    """Blocks of residuals: the state at each time is compared for blocks of some numbers with frames at some times."""
     parts: list[list[tuple[Tensor, Tensor, Tensor]]] = [[] for _ in range(count)]
     runs = states_of(simulation, values, [moment for moment, _ in wanted], alike=careful)
     for number, ((_, what), states) in enumerate(zip(wanted, runs, strict=True)):
@@ -143,7 +137,6 @@ def facing(normals: Tensor, points: Tensor, camera: Camera) -> Tensor:
 
 
 def _patch_of(points: Tensor) -> Tensor:
-    """Return the index of each point's square (T,), in a grid over the two longest directions of all points (T, 3)."""
     if len(points) < 3:
         return torch.zeros(len(points), dtype=torch.long)
     centred = (points - points.mean(0)).double()
@@ -162,8 +155,7 @@ def explained(
 ) -> dict[str, float]:
     """The share of the motion of tracks that were not fitted which a simulation explains, by camera, 0 to 1.
 
-    A track that slipped off the object may be many times as far away as the object moves, and explains nothing, no
-    less: one of them would decide the sum of all.
+    A track that slipped off the object explains nothing, no less: one of them would decide the sum of all.
     """
     parts = [Evidence(simulation, video, split(own)[1]) for video, own in zip(videos, tracks, strict=True)]
     sums = [torch.zeros(2, len(part.rest), dtype=torch.float64) for part in parts]
@@ -198,9 +190,8 @@ def trusted(
 ) -> list[Evidence]:
     """Return evidence whose points count less where, and when, other grids move them otherwise.
 
-    A flapping flag is soon elsewhere on another grid, by many times the error of a track. Such residuals would pull the
-    values to where they make up for the grid. A residual is multiplied by :math:`(1 + d^2 / n^2)^{-1/2}`, with the root
-    mean square distance d of the point in a frame of the other grids from that of its own, and the error n of a track.
+    Such residuals would pull the values to where they make up for the grid. They are multiplied by
+    :math:`(1 + d^2 / n^2)^{-1/2}`, with the root mean square distance d on the other grids, and the error n of a track.
     """
     if not others:
         return list(evidence)
@@ -221,8 +212,7 @@ def trusted(
 def distrust(evidence: Sequence[Evidence], times: Sequence[float]) -> float:
     r"""Return what the trust in points adds to the cost of a place: the mean of :math:`-2 \log` of it.
 
-    Points that count less have smaller residuals. That is no better fit: with the larger variance that is assumed of
-    them, minus the logarithm of the likelihood has this term for their two coordinates.
+    It is the likelihood of their larger variance: points that count less are no better fit.
     """
     found = []
     for part in evidence:
@@ -235,7 +225,6 @@ def distrust(evidence: Sequence[Evidence], times: Sequence[float]) -> float:
 def _pixels(
     simulation: Simulation, parts: Sequence[Evidence], values: Values, times: Sequence[float]
 ) -> Iterator[tuple[int, int, Tensor]]:
-    """Number of the part, number of the frame, and where it would have the part's points [pixels], shape (T, 2)."""
     for time, states in zip(times, states_of(simulation, [values], times, alike=False), strict=True):
         for number, part in enumerate(parts):
             if (frame := part.video.frame_at(time)) is not None:

@@ -86,7 +86,6 @@ SPREAD = ("wind.speed", "wind.azimuth", "material.E")  # searched although a sta
 APART, SAME = 0.15, 0.03  # least distance of starts, and largest of ends that are the same, as shares of a range
 BRIEF, REFINED, TRIES = 4, 5, 2  # most iterations of a short solve, and on another grid; steps that are tried for each
 RIVAL, MIRRORED = 1.05, 1.25  # cost per the best below which another end is a rival; that of the mirrored wind
-DRAG = ("aero.C_D", "aero.C_F")  # coefficients that scale the force of the wind
 GRIDS = (0.8, 1.25)  # cells of other grids that tell the error of the grid, per its own
 BEGUN, BEGINS, MOST_STARTS = 12, 10, 60  # simulations, starts of each at the first frame, and in the search
 LONG, COARSER = 300.0, 1.3  # time of a fit above which a coarser grid is proposed [s], and its cells
@@ -222,24 +221,21 @@ class Problem:
 
     def evidence(self, matched: Sequence[float] | None = None) -> list[Evidence]:
         """What each video shows: points that are followed, or that are matched at a place."""
-        tracks = self.tracks if matched is None else []
-        if matched is not None:
-            states = dict(zip(self.fitted, self._states(matched, self.fitted), strict=True))
-            for video in self.videos:
-                own = [state for moment, state in states.items() if video.frame_at(moment) is not None]
-                tracks = [*tracks, match(self.simulation, video, own, self.plan.tracks, self.moving)]
-        pairs = zip(self.videos, tracks, strict=True)
-        return [Evidence(self.simulation, video, split(own)[0]) for video, own in pairs]
+        states = [] if matched is None else list(zip(self.fitted, self._states(matched, self.fitted), strict=True))
+        found = []
+        for k, video in enumerate(self.videos):
+            shown = [state for moment, state in states if video.frame_at(moment) is not None]
+            tracks = match(self.simulation, video, shown, self.plan.tracks, self.moving) if states else self.tracks[k]
+            found.append(Evidence(self.simulation, video, split(tracks)[0]))
+        return found
 
     def trusted(self, evidence: Sequence[Evidence], place: Sequence[float]) -> list[Evidence]:
-        """The evidence, with less trust where other grids show something else at a place."""
         return trusted(self.simulation, self.grids, evidence, self.values(place), self.fitted)
 
     def _states(self, place: Sequence[float], times: Sequence[float]) -> list[State]:
         return [own[0] for own in states_of(self.simulation, [self.values(place)], times, alike=False)]
 
     def values(self, place: Tensor | Sequence[float]) -> dict[str, float]:
-        """Values of the unknowns at a place, given as shares of the ranges."""
         return values_at(self.plan.unknowns, place)
 
     def residuals(self, evidence: Sequence[Evidence], times: Sequence[float]) -> Residuals:
@@ -352,10 +348,9 @@ class Problem:
             ended, costs = self._brief([list(place), *tried], evidence, self.fitted)
         except DivergedError:
             return []
-        for end, cost in zip(ended, costs, strict=True):
-            self.say(f"rival: cost {cost:.5g}, {self._shown(end)}")
         near = []
         for end, cost in zip(ended, costs, strict=True):
+            self.say(f"rival: cost {cost:.5g}, {self._shown(end)}")
             most = MIRRORED if is_mirrored(model, unknowns, place, end) else RIVAL
             if cost < most * costs[0] and apart_by(unknowns, end, place) > 2 * SAME:
                 near.append(self.values(end))
@@ -399,7 +394,9 @@ class Problem:
                 kept()
             course.place, *course.rivals = self.best_of(course.starts)
             self.say(f"search: {self._shown(course.place)}")
-            self._check_apart(course.place)
+            at = torch.tensor(course.place, dtype=torch.float64)
+            matrix = linearised(self.residuals(self.evidence(), self.fitted), at).matrix
+            check_apart(directions(matrix, self.plan.unknowns, at), self.plan.unknowns, self.plan.limit, self.say)
             course.step = 0
             kept()
         result = self.result(course, self._stepped(course, kept), films)
@@ -465,12 +462,9 @@ class Problem:
 
     def notes(self) -> list[str]:
         """Sentences on what speaks against the plan: unknowns that are confounded, a camera, a missing start."""
-        found = [
-            f"wind.speed and {name} move the object in nearly the same way, so both may be far off: put one of them "
-            "into `known`."
-            for name in DRAG
-            if {name, "wind.speed"} <= set(self.sought)
-        ]
+        both = "move the object in nearly the same way, so both may be far off: put one of them into `known`."
+        drag = [name for name in ("aero.C_D", "aero.C_F") if {name, "wind.speed"} <= set(self.sought)]
+        found = [f"wind.speed and {name} {both}" for name in drag]
         if "camera" in self.plan.assumed:
             found.append(
                 "The camera was found from a frame in which the object may move already, so all values may be off: "
@@ -495,15 +489,6 @@ class Problem:
             ]
         return []
 
-    def _check_apart(self, place: Sequence[float]) -> None:
-        """Raise ValueError if the unknowns cannot be told apart at a place."""
-        at = torch.tensor(place, dtype=torch.float64)
-        normal = linearised(self.residuals(self.evidence(), self.fitted), at)
-        found = directions(normal.matrix, self.plan.unknowns, at)
-        for strength, _, told in found:
-            self.say(f"sensitivity {strength:9.3g}: {told}")
-        check_apart(found, self.plan.unknowns, self.plan.limit)
-
     def _shown(self, place: Sequence[float]) -> str:
         return ", ".join(f"{name} {value:.5g}" for name, value in self.values(place).items())
 
@@ -518,15 +503,9 @@ def run_fit(
     started: Callable[[], None] = lambda: None,
     in_use: Sequence[Path] = (),
 ) -> Fit:
-    """Do a fit and write its folder: values.csv, result.json, scene.yaml and pictures.
+    """Do a fit, or continue it after its last step, and write its folder.
 
-    Args:
-        plan: From :func:`~gaussian_swaying.inverse.plan.read_plan`.
-        resume: Continue the fit in it after its last step.
-        device: ``auto``, ``cpu`` or ``cuda``.
-        progress: Print a line for each step, and a bar.
-        started: Called when the fit can be continued.
-        in_use: Other files that are needed, as the fit file: an earlier fit in a folder with one is not moved aside.
+    ``started`` is called when it can be continued. An earlier fit is not moved aside with files that are ``in_use``.
     """
     begin, folder, parser = time.monotonic(), Path(output), Simulation.parser()
     settings = parse_base(plan, parser)
@@ -619,27 +598,22 @@ def fit(
         videos: Folders with transforms.json, see :func:`~gaussian_swaying.inverse.videos.read_videos`.
         unknowns: For each unknown its range, such as ``{"wind.speed": [1, 10]}``, or ``{"range": [1, 10], "scale":
             "log", "start": 3}``.
-        output: Folder for the results.
-        resume: Continue the fit in it.
+        output: Folder for the results, in which a fit may be continued (``resume``).
         device: ``auto``, ``cpu`` or ``cuda``.
         progress: Print a line for each step, and a bar.
         settings: Further fields of :class:`~gaussian_swaying.inverse.plan.Plan`, such as ``known`` and ``until``.
     """
-
-    def names(given: Any) -> list[str]:
-        return [os.fspath(given)] if isinstance(given, str | os.PathLike) else [os.fspath(one) for one in given]
-
-    sought = [read_unknown(name, entry) for name, entry in unknowns.items()]
-    plan = Plan(names(base), names(videos), sought, **settings)
+    several = ([given] if isinstance(given, str | os.PathLike) else given for given in (base, videos))
+    own, films = ([os.fspath(name) for name in names] for names in several)
+    plan = Plan(own, films, [read_unknown(name, entry) for name, entry in unknowns.items()], **settings)
     return run_fit(plan, output, resume=resume, device=device, progress=progress)
 
 
 def _described(plan: Plan, simulation: Simulation) -> dict[str, Any]:
-    """Return the resume key: all settings that must be the same in a fit and the one that it continues."""
+    """All settings that must be the same in a fit and the one that it continues, as they will be read."""
     own = {name: value for name, value in vars(plan).items() if name not in ("base", "unknowns", "iterations")}
     sought = {u.name: [u.low, u.high, u.scale, u.start] for u in plan.unknowns}
-    told = {**own, "unknowns": sought, "scene": simulation.config}
-    return json.loads(json.dumps(told))  # as it will be read
+    return json.loads(json.dumps({**own, "unknowns": sought, "scene": simulation.config}))
 
 
 def _read_course(folder: Path, described: Mapping[str, Any]) -> Course:

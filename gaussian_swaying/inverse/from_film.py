@@ -6,9 +6,8 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -59,13 +58,11 @@ SOFTER, STIFFER = 1 / 30, 30.0  # range of E, per that which the preview guesses
 SPEED = (0.5, 25.0)  # range of the wind [m/s]
 ROUGH = 1.2e-3  # residual of a camera that may be wrong, per diagonal of the picture
 UPRIGHT, NEARLY = 0.5, 0.85  # cosines to the film's up of a guess that is right, and of an axis that is taken
-OBJECT = "object"  # name of the whole in a length
 SHORTER, LONGER = 0.25, 4.0  # range of lengths, per the guess, if the weight is to tell them
 Length = tuple[str, float] | Literal["gravity"] | None
 
 
-@dataclass(frozen=True)
-class Seen:
+class Seen(NamedTuple):
     """The first frame, the splat, the camera with its residual [pixels], and the splat's picture from there."""
 
     film: Film
@@ -107,26 +104,16 @@ def fit_film(
         ValueError: If the film does not show the splat, or nothing moves; the message names the remedy.
     """
     say = print if progress else lambda line: None
-    file = prepare(film, splat, output, length=length, up=up, hold=hold, focal=focal, device=device, say=say)
+    file = prepare(film, splat, output, length, up, hold, focal, device, say)
     return run_fit(read_plan(file), file.parent / RESULT, device=device, progress=progress, in_use=[file])
 
 
 def prepare(
-    film: str | os.PathLike[str],
-    splat: str | os.PathLike[str],
-    output: str | os.PathLike[str],
-    *,
-    length: Length = None,
-    up: str | Sequence[float] | None = None,
-    hold: str | None = None,
-    focal: float | None = None,
-    device: str = "auto",
+    film: str | os.PathLike[str], splat: str | os.PathLike[str], output: str | os.PathLike[str], length: Length,
+    up: str | Sequence[float] | None, hold: str | None, focal: float | None, device: str,
     say: Callable[[str], object] = print,
-) -> Path:
-    """Write the files of a fit and pictures of what they rest on, say what was found, and return the fit file.
-
-    The arguments are those of :func:`fit_film`.
-    """
+) -> Path:  # fmt: skip
+    """Write the files of :func:`fit_film` and pictures of what they rest on, say what was found; the fit file."""
     import imageio.v3 as iio
 
     if focal is not None and not 5 <= focal <= 1000:
@@ -206,7 +193,7 @@ def registered(
 
 
 def _background(seen: Seen) -> list[float]:
-    """The colour that most of the first frame has where the splat is not; that of all of it if it is everywhere."""
+    """The colour that most of the first frame has where the splat is not, or all of it."""
     around = seen.picture.alpha[..., 0].cpu() < 0.05
     pixels = seen.frame[around] if bool(around.any()) else seen.frame.flatten(0, 1)
     return [round(value / 255, 3) for value in pixels.median(0).values.tolist()]
@@ -242,10 +229,7 @@ def _shown(seen: Seen, video: Footage, preview: Suggestion, wanted: dict[str, An
 
 
 def upright_in(camera: Camera, guess: Sequence[float]) -> list[float] | None:
-    """The direction of a splat that is up in a film, which nobody holds upside down; None if a guess (3,) is, too.
-
-    It is an axis of the splat if one is near.
-    """
+    """The direction of a splat, an axis if one is near, that is up in a film; None if a guess (3,) is, too."""
     up = -camera.world_to_camera[1, :3].double()
     if float(up @ torch.tensor(guess, dtype=torch.float64)) > UPRIGHT:
         return None
@@ -256,11 +240,11 @@ def upright_in(camera: Camera, guess: Sequence[float]) -> list[float] | None:
 def longest_side(name: str, metres: float, seen: Seen, preview: Suggestion) -> float:
     """The longest side [m] with which ``object``, a part, or two places X,Y:X,Y in the first frame have that length.
 
-    The preview is that of the splat with a longest side of 1 m.
+    That of the preview is 1 m.
     """
     if not 0 < metres < math.inf:
         raise ValueError(f"Expected `--length` to have a length above 0 m, but got {metres}.")
-    if name == OBJECT:
+    if name == "object":
         return metres
     if ":" in name:
         return metres / (float((_place(name, 0, seen) - _place(name, 1, seen)).norm()) * preview.metres_per_unit)
@@ -268,8 +252,8 @@ def longest_side(name: str, metres: float, seen: Seen, preview: Suggestion) -> f
     names = [] if parts is None else parts.names
     if parts is None or name not in names:
         raise ValueError(
-            f"The splat has no part {name!r}: `--length` may name {', '.join([*names, OBJECT])}, or two places in the "
-            "first frame, such as 120,80:120,640 (pixels from its left and upper edges)."
+            f"The splat has no part {name!r}: `--length` may name {', '.join([*names, 'object'])}, or two places in "
+            "the first frame, such as 120,80:120,640 (pixels from its left and upper edges)."
         )
     return metres / (extent(seen.cloud.means[parts.mask(name)], preview.up.direction) * preview.metres_per_unit)
 
@@ -285,7 +269,6 @@ def extent(points: Tensor, up: Sequence[float]) -> float:
 
 
 def _place(name: str, number: int, seen: Seen) -> Tensor:
-    """The place in the splat that a pixel of the first frame shows, shape (3,)."""
     try:
         x, y = (float(value) / seen.film.full for value in name.split(":")[number].split(","))
     except ValueError:

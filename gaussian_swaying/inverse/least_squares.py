@@ -22,13 +22,7 @@ DIVERGED = "Every simulation of a step diverged: narrow the ranges of `unknowns`
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Residuals of some variants.
-
-    Attributes:
-        values: Places in the simulation minus those in the film [pixels], for each variant, float64, shape (B, R, D).
-        cluster: Index of the cluster of correlated residuals that each belongs to, shape (R,).
-        moment: Index of the part of the time that each belongs to, shape (R,); None if all are of one.
-    """
+    """Residuals of some variants [pixels], float64, shape (B, R, D), and their clusters by place and by time, (R,)."""
 
     values: Tensor
     cluster: Tensor
@@ -44,10 +38,7 @@ class DivergedError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """An end: its place (U,), its residuals and their standard deviation, and why no more steps were tried.
-
-    ``ended`` is empty if their number ran out; ``steps`` counts them.
-    """
+    """An end: its place (U,), its residuals and their standard deviation, and why it is one; empty if steps ran out."""
 
     place: Tensor
     block: Block
@@ -80,10 +71,9 @@ def scale_of(block: Block, least: float = LEAST) -> float:
 def solve(
     residuals: Residuals, place: Tensor, most: int, closely: bool = False, scale: Callable[[Block], float] = scale_of
 ) -> Solved:
-    """Minimise the cost from a place by SciPy's dogleg within the ranges; ``closely`` if small steps count.
+    """Minimise the cost from a place by so many steps of SciPy's dogleg; ``closely`` if small ones count.
 
-    At most so many steps are tried. The standard deviation of the residuals is that of the place, and is estimated anew
-    where it ends, until it stays.
+    The standard deviation of the residuals is that of the place, and is estimated anew where it ends, until it stays.
     """
     from scipy.optimize import least_squares
 
@@ -144,14 +134,7 @@ def _beside(place: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True, eq=False)
 class Normal:
-    """Normal equations: sums over the residuals and their sensitivities at a point.
-
-    Attributes:
-        gradient: Weighed sum of sensitivity times residual, shape (U,).
-        matrix: Weighed sum of sensitivity times sensitivity, J^T W J, shape (U, U).
-        scores: The gradient of each cluster of correlated residuals, shape (C, U): patches of the object at all times,
-            and parts of the time all over the object.
-    """
+    """Normal equations at a point: J^T W r (U,), J^T W J (U, U), and the gradients of both kinds of clusters (C, U)."""
 
     gradient: Tensor
     matrix: Tensor

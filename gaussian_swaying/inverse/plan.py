@@ -21,27 +21,12 @@ if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
 LISTS = ("base", "videos", "cameras", "assumed", "also_moves")
-ASSUMED = ("length", "mass", "camera")  # things in a base that nobody measured, perhaps
+ASSUMED = ("length", "mass", "camera")
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The settings of a fit.
-
-    Args:
-        base: Configuration files of ``sim``: the splat, the solver, and first values.
-        videos: Folders with transforms.json.
-        known: Options of ``sim`` that replace those of the base.
-        until: Fit the frames up to this time [s], half of them if it is None; the rest is predicted.
-        search: Number of simulations of the coarse search; 0 starts at ``start`` or in the middle of the ranges.
-        iterations: Most iterations of a step.
-        tracks: Most tracks of a camera.
-        limit: Largest condition number of the sensitivities; above it the fit is refused.
-        cameras: Names of the cameras that are used; None for all.
-        assumed: What nobody measured, of :data:`ASSUMED`; the result says what follows.
-        hand_held: Whether the cameras move otherwise than the videos say; None if their background is to tell.
-        also_moves: Names of parts of the splat that move in the videos, though the simulation does not move them.
-    """
+    """The settings of a fit, which docs/fit.md describes."""
 
     base: Sequence[str]
     videos: Sequence[str]
@@ -67,13 +52,7 @@ class Plan:
 
 
 def read_plan(path: str | os.PathLike[str], find: Callable[[str], str] = str) -> Plan:
-    """Read a ``fit.yaml``; docs/fit.md describes it.
-
-    Args:
-        path: The file. Paths in ``base``, ``videos`` and ``known`` are relative to its folder if they exist there, else
-            to the working directory.
-        find: Gives the file of a name in ``base`` that is not there.
-    """
+    """Read a ``fit.yaml``, see docs/fit.md; ``find`` gives the file of a name in ``base`` that is not beside it."""
     file, names = Path(path), [entry.name for entry in fields(Plan)]
     read = read_fields(file, "the fit file", names, partial(refuse_gone, within="fit"))
     given: dict[str, Any] = {

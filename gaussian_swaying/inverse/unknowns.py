@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -169,8 +169,15 @@ def directions(matrix: Tensor, unknowns: Sequence[Unknown], place: Tensor) -> li
     return found
 
 
-def check_apart(found: Sequence[Direction], unknowns: Sequence[Unknown], limit: float) -> None:
-    """Raise ValueError if the largest singular value is more than ``limit`` times the smallest."""
+def check_apart(
+    found: Sequence[Direction],
+    unknowns: Sequence[Unknown],
+    limit: float,
+    say: Callable[[str], object] = lambda line: None,
+) -> None:
+    """Say the directions, and raise ValueError if the largest singular value is over ``limit`` times the smallest."""
+    for strength, _, told in found:
+        say(f"sensitivity {strength:9.3g}: {told}")
     (best, *_), (worst, parts, sentence) = found[0], found[-1]
     condition = best / max(worst, 1e-300)
     if len(unknowns) < 2 or condition <= limit:

@@ -38,13 +38,7 @@ MOST_PIXELS = 40_000_000  # most pixels of a frame of a film; 8K has 33 million.
 
 @dataclass(frozen=True, eq=False)
 class Footage:
-    """The video of one camera.
-
-    Attributes:
-        times: Time of each frame since the motion began [s], ascending.
-        cameras: The camera of each frame; the same one for a tripod.
-        images: Frames, dtype uint8, shape (F, H, W, 3).
-    """
+    """The video of one camera: times [s], ascending, cameras, and frames, dtype uint8, shape (F, H, W, 3)."""
 
     name: str
     times: tuple[float, ...]
@@ -66,7 +60,7 @@ Shot = tuple[float, Camera, Tensor]  # time [s], camera and image of a frame
 
 
 class _Room:
-    """How many frames and bytes the videos of a fit may still decode, and near plane and origin of their cameras."""
+    """What the videos of a fit may still decode, and near plane and origin of their cameras."""
 
     def __init__(self, near: float, origin: Origin) -> None:
         self.frames, self.bytes, self.near, self.origin = MOST_FRAMES, MOST_BYTES, near, origin
@@ -97,12 +91,9 @@ def read_videos(
 ) -> list[Footage]:
     """Read the videos of one motion, one for each camera, sorted by name. The earliest frame is at time zero.
 
-    docs/fit.md describes ``transforms.json`` of a folder. Cameras that are not wanted are not decoded; the others
-    together may have :data:`MOST_FRAMES` and :data:`MOST_BYTES`.
-
     Args:
-        paths: A folder or a transforms.json, or several. Their times belong to the same clock.
-        cameras: Names of the cameras that are wanted; None for all.
+        paths: A folder or a transforms.json, or several, of one clock; docs/fit.md describes them.
+        cameras: Names of the cameras that are wanted, and decoded; None for all.
         size: Size of what they show [scene units], which the near plane of the cameras follows.
         origin: Point of the files from which the places of the splat count.
     """
@@ -199,7 +190,6 @@ def _picture(item: PosedImage, time: float, room: _Room) -> list[Shot]:
 
 
 def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float, room: _Room) -> list[Shot]:
-    """The frames of a video file, decoded one by one as long as there is room."""
     entry = data["frames"][index]
     path = check_regular(file.parent / str(entry["video_path"]), "the video")
     fps, begun, seconds = (read_number(where, entry, name) for name in ("fps", "begin", "seconds"))
@@ -249,13 +239,13 @@ def check_wide(path: Path, width: int, height: int) -> tuple[int, int]:
 def frames_of(
     path: Path, inputs: Sequence[str] = (), outputs: Sequence[str] = (), grey: bool = False
 ) -> Generator[Any, None, None]:
-    """Read a film at the frame rate that its head states, with options of ffmpeg for the file and for the frames.
+    """Read a film with options of ffmpeg for the file and for the frames, at the frame rate that its head states.
 
-    ffmpeg would repeat frames of a film with a variable rate up to a higher one, which the head does not tell.
+    Of a variable rate, ffmpeg would repeat frames up to a higher one.
 
     Yields:
-        The head as of imageio-ffmpeg, whose ``fps`` is the rate of the frames (0 if it is not known), then the bytes of
-        each frame: one a pixel if ``grey``, else three.
+        The head as of imageio-ffmpeg, whose ``fps`` is 0 if it is not known, then the bytes of each frame: one a pixel
+        if ``grey``, else three.
     """
     from imageio_ffmpeg import read_frames
 
@@ -271,7 +261,7 @@ def frames_of(
 
 
 def _rate(stated: float) -> Fraction:
-    """The frame rate of a film, whose head rounds that of television to two digits, such as 24000/1001 to 23.98."""
+    """The frame rate of a film, whose head rounds that of television, such as 24000/1001 to 23.98."""
     television = Fraction(1000 * round(1.001 * stated), 1001)
     rounded = stated != round(stated) and abs(television - stated) < 0.0051
     return television if rounded else Fraction(stated).limit_denominator(100)
