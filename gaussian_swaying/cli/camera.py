@@ -54,7 +54,7 @@ def write_camera(options: argparse.Namespace) -> int:
     from gaussian_swaying.captures.images import read_image
     from gaussian_swaying.gaussians.formats import read_gaussians
     from gaussian_swaying.inverse import registration
-    from gaussian_swaying.inverse.film import open_film
+    from gaussian_swaying.inverse.from_film import open_film
     from gaussian_swaying.inverse.report import side_by_side, titled
 
     if options.fov is not None and not 0 < options.fov < 180:

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.inverse.least_squares import Block
+from gaussian_swaying.inverse.plan import FILM_START, Values
 from gaussian_swaying.inverse.tracks import Tracks
-from gaussian_swaying.inverse.unknowns import FILM_START, Values
 from gaussian_swaying.inverse.variants import states_of
 from gaussian_swaying.inverse.videos import Footage
 from gaussian_swaying.mpm.state import State

@@ -42,7 +42,19 @@ from gaussian_swaying.inverse.least_squares import (
     solve,
     step_from,
 )
-from gaussian_swaying.inverse.plan import Plan, parse_base, read_unknown
+from gaussian_swaying.inverse.plan import (
+    FILM_START,
+    Plan,
+    apart_by,
+    check_apart,
+    check_unknowns,
+    directions,
+    is_mirrored,
+    mirrored_place,
+    parse_base,
+    read_unknown,
+    values_at,
+)
 from gaussian_swaying.inverse.registration import AWAY, first_look
 from gaussian_swaying.inverse.report import (
     BEFORE,
@@ -56,16 +68,6 @@ from gaussian_swaying.inverse.report import (
     write_results,
 )
 from gaussian_swaying.inverse.tracks import Tracks, beside_rest, match, opencv, still_until, track
-from gaussian_swaying.inverse.unknowns import (
-    FILM_START,
-    apart_by,
-    check_apart,
-    check_unknowns,
-    directions,
-    is_mirrored,
-    mirrored_place,
-    values_at,
-)
 from gaussian_swaying.inverse.variants import check_variants, states_of
 from gaussian_swaying.inverse.videos import Footage, frame_times, read_videos
 from gaussian_swaying.mpm.state import State

@@ -1,27 +1,273 @@
-"""The plan of a fit: what is sought, what is known, and how."""
+"""The plan of a fit: unknowns and settings, what a film cannot tell apart, and other values that may explain it."""
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import torch
+from torch import Tensor
+
 from gaussian_swaying._arguments import check_arguments, is_number
 from gaussian_swaying._checks import check_choice, check_whole
+from gaussian_swaying._fixed import changed
+from gaussian_swaying._live import Live
 from gaussian_swaying._yaml_limits import read_fields
 from gaussian_swaying.config.gone import refuse_gone
 from gaussian_swaying.config.parser import check_settings, import_forces, option
-from gaussian_swaying.inverse.unknowns import Unknown, default_scale
+from gaussian_swaying.simulation.model import Model, find, flow_of, names
 from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.wind.field import WindField
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
+
+Values = Mapping[str, float]  # values of the unknowns, by name
+SCALES = ("log", "linear")
+SCALE, FILM_START = "scene.metres_per_unit", "film.start"  # start of the motion [s]; below 0, the wind has blown before
+FLAT = 0.8  # mean square of the area that faces one way, from which the wind may be mirrored
+TURN, MIRROR = 5.0, 20.0  # least angle between wind and mirror image, and largest to another end [degrees]
+LARGE = 0.25  # share of the largest part of a direction below which an unknown is not named
+Direction = tuple[float, list[float], str]  # how strong, its shares of the unknowns, and in words
+OF_FILM = {FILM_START: Live("s"), SCALE: Live("m", scale="log")}  # unknowns that are no numbers of the simulation
 LISTS = ("base", "videos", "cameras", "assumed", "also_moves")
 ASSUMED = ("length", "mass", "camera")
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """An unknown of a fit.
+
+    Args:
+        name: A number of :class:`~gaussian_swaying.simulation.model.Model`, such as ``material.E`` or ``wind.speed``,
+            or one of :data:`OF_FILM`.
+        scale: ``log`` or ``linear``.
+        start: First value; None for a coarse search over the range.
+
+    Raises:
+        ValueError: If the name is unknown or the range makes no sense; the message names the unknown.
+    """
+
+    name: str
+    low: float
+    high: float
+    scale: str = "linear"
+    start: float | None = None
+
+    def __post_init__(self) -> None:
+        where = f"unknowns.{self.name}"
+        check_choice(f"{where}.scale", self.scale, SCALES)
+        known = known_unknown(self.name)
+        if known is None or known.kind != "number":
+            possible = {n: known_unknown(n.replace("*", "0")) for n in (*OF_FILM, *names())}
+            sought = [n for n, one in possible.items() if one and one.kind == "number"]
+            raise ValueError(f"`{self.name}` cannot be sought: use {', '.join(sought)}, or put it into `known`.")
+        if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
+            raise ValueError(f"Expected `{where}.range` to be [low, high], but got [{self.low}, {self.high}].")
+        if self.scale == "log" and self.low <= 0:
+            raise ValueError(f"Expected `{where}.range` above 0 with `scale: log`, but got {self.low}.")
+        for end in (self.low, self.high):
+            known.check(f"{where}.range", end)
+        if self.start is not None and not self.low <= self.start <= self.high:
+            raise ValueError(f"Expected `{where}.start` within its range, but got {self.start}.")
+
+    @property
+    def unit(self) -> str:
+        known = known_unknown(self.name)
+        return known.unit if known else ""
+
+    def value(self, share: float) -> float:
+        """The value at a share of the range, 0 at ``low`` and 1 at ``high``."""
+        if self.scale == "log":
+            return self.low * (self.high / self.low) ** share
+        return self.low + share * (self.high - self.low)
+
+    def share(self, value: float) -> float:
+        """Return the share of the range at which a value lies, 0 to 1; logarithmic if ``scale`` is."""
+        if self.scale == "log":
+            return math.log(value / self.low) / math.log(self.high / self.low)
+        return (value - self.low) / (self.high - self.low)
+
+    def slope(self, share: float) -> float:
+        """Change of the value per share of the range."""
+        return self.value(share) * math.log(self.high / self.low) if self.scale == "log" else self.high - self.low
+
+
+def known_unknown(name: str) -> Live | None:
+    """The number of an unknown; None if there is none."""
+    return OF_FILM.get(name) or find(name)
+
+
+def default_scale(name: str, low: float) -> str:
+    """``log`` for positive sizes, ``linear`` for angles, Poisson's ratio and ranges that reach zero."""
+    known = known_unknown(name)
+    return "log" if low > 0 and known and known.scale == "log" else "linear"
+
+
+def values_at(unknowns: Sequence[Unknown], place: Iterable[float]) -> dict[str, float]:
+    """Values of unknowns at a place, given as shares of their ranges."""
+    return {u.name: u.value(float(share)) for u, share in zip(unknowns, place, strict=True)}
+
+
+def of_simulation(values: Values) -> dict[str, float]:
+    """The values that are numbers of the simulation."""
+    return {name: value for name, value in values.items() if name not in OF_FILM}
+
+
+def model_of(model: Model, values: Values) -> Model:
+    """The model of a variant, at another scale if its values say so."""
+    found = model.at(of_simulation(values))
+    return at_scale(found, values[SCALE]) if SCALE in values else found
+
+
+def check_unknowns(simulation: Simulation, unknowns: Sequence[Unknown]) -> None:
+    """Raise ValueError if a simulation has no such parameter as an unknown; the message names it and the remedy."""
+    names = [unknown.name for unknown in unknowns]
+    if not names:
+        raise ValueError("Expected `unknowns` to have at least one entry, such as wind.speed: add it.")
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"`{name}` is in `unknowns` twice: remove one.")
+    model_of(simulation.model, {unknown.name: unknown.value(0.5) for unknown in unknowns})
+
+
+def at_scale(model: Model, metres_per_unit: float) -> Model:
+    """A model, whose values are meant in metres, that moves as if a scene unit had another length [m]."""
+    wind, scene = model.wind, model.scene
+    gravity, sheet = model.value("solver.gravity"), not scene.filled
+    if not any(gravity):
+        raise ValueError(f"Without gravity nothing tells `{SCALE}`: set `solver.gravity`, or measure a length.")
+    only = f"`{SCALE}` can be sought only"
+    if not isinstance(wind, WindField) or len(wind.modulations) or len(wind.effects) or model.air or model.forces:
+        raise ValueError(
+            f"{only} in a plain wind: remove `wind.modulations`, `wind.effects`, `air` and `forces`, or measure a "
+            "length."
+        )
+    if model.material.volume != "patch" or model.points.count != scene.on_surface + scene.filled:
+        raise ValueError(f"{only} with `material.volume: patch` and `scene.layers: 1`: set them, or measure a length.")
+    bending = model.points.bending
+    if bending is not None and (isinstance(model.material.bending, str) or model.material.regions):
+        raise ValueError(
+            f"{only} with one `material.bending` in N m: give it as a number and without parts, or measure a length."
+        )
+    ratio = metres_per_unit / scene.frame.metres_per_unit
+    changes = {"material.E": model.value("material.E") / ratio ** (3 if sheet else 2)}
+    if sheet:
+        changes["material.density"] = model.value("material.density") / ratio
+    found = model.at(changes | {"solver.gravity": [part / ratio for part in gravity]})
+    if bending is not None:
+        found = found.replace(points=replace(found.points, bending=bending / ratio**5))
+    if model.aero.added_mass:
+        found = replace(found, aero=changed(model.aero, added_mass=model.aero.added_mass / ratio))
+    return replace(found, wind=changed(wind, flows=wind.flows / ratio))
+
+
+def directions(matrix: Tensor, unknowns: Sequence[Unknown], place: Tensor) -> list[Direction]:
+    """The principal directions of the sensitivities J^T W J (U, U) at a place (U,), the best known first."""
+    values, vectors = torch.linalg.eigh(matrix)
+    found = []
+    for value, parts in zip(values.flip(0).tolist(), vectors.flip(1).mT.tolist(), strict=True):
+        lead = max(range(len(parts)), key=lambda k: abs(parts[k]))
+        unknown, share = unknowns[lead], float(place[lead])
+        own = abs(unknown.value(share))
+        # how far along the direction until the largest part has changed by a tenth of its value, or of its range
+        far = 0.1 * own / abs(unknown.slope(share)) if own and unknown.scale == "log" else 0.1
+        told = changes([far / parts[lead] * part for part in parts], unknowns, place)
+        found.append((math.sqrt(max(value, 0.0)), parts, told))
+    return found
+
+
+def check_apart(
+    found: Sequence[Direction],
+    unknowns: Sequence[Unknown],
+    limit: float,
+    say: Callable[[str], object] = lambda line: None,
+) -> None:
+    """Say the directions, and raise ValueError if the largest singular value is over ``limit`` times the smallest."""
+    for strength, _, told in found:
+        say(f"sensitivity {strength:9.3g}: {told}")
+    (best, *_), (worst, parts, sentence) = found[0], found[-1]
+    condition = best / max(worst, 1e-300)
+    if len(unknowns) < 2 or condition <= limit:
+        return
+    largest, told = max(map(abs, parts)), f"(condition {condition:.3g}, limit {limit:g})"
+    names = [f"`{u.name}`" for u, part in zip(unknowns, parts, strict=True) if abs(part) > LARGE * largest]
+    if len(names) == 1:
+        raise ValueError(f"The video does not tell {names[0]} {told}: put it into `known`, or raise `limit`.")
+    raise ValueError(
+        f"The video cannot tell {', '.join(names[:-1])} and {names[-1]} apart: {sentence} changes nothing that "
+        f"is seen {told}. Put one of them into `known`, or raise `limit`."
+    )
+
+
+def changes(step: Sequence[float], unknowns: Sequence[Unknown], place: Tensor) -> str:
+    """A step, in shares of the ranges, in words: ``raising wind.speed by 10% and lowering material.E by 20%``."""
+    largest, words = max(map(abs, step)), []
+    for u, part, share in zip(unknowns, step, place.tolist(), strict=True):
+        if abs(part) <= LARGE * largest:
+            continue
+        change, own = part * u.slope(share), abs(u.value(share))
+        amount = f"{abs(change) / own:.0%}" if u.scale == "log" and own else f"{abs(change):.2g} {u.unit}".strip()
+        words.append(f"{'raising' if change > 0 else 'lowering'} {u.name} by {amount}")
+    return " and ".join(words) if len(words) < 3 else ", ".join(words[:-1]) + " and " + words[-1]
+
+
+def apart_by(unknowns: Sequence[Unknown], one: Sequence[float], other: Sequence[float]) -> float:
+    """Return the largest distance of two places, as a share of a range; azimuths 360 degrees apart are the same."""
+    most = 0.0
+    for unknown, a, b in zip(unknowns, one, other, strict=True):
+        wide = unknown.high - unknown.low
+        turned = unknown.name == "wind.azimuth"
+        most = max(most, abs(turn(wide * (a - b))) / wide if turned else abs(a - b))
+    return most
+
+
+def turn(angle: float) -> float:
+    """An angle between -180 and 180 degrees."""
+    return (angle + 180) % 360 - 180
+
+
+def mirrored_place(model: Model, unknowns: Sequence[Unknown], place: Sequence[float]) -> list[list[float]]:
+    """The place with the mirrored wind, as shares of the ranges; none if there is none within them."""
+    for k, unknown in enumerate(unknowns):
+        if unknown.name == "wind.azimuth" and (azimuth := mirrored(model, values_at(unknowns, place))) is not None:
+            middle = 0.5 * (unknown.low + unknown.high)
+            share = unknown.share(middle + turn(azimuth - middle))
+            return [[*place[:k], share, *place[k + 1 :]]] if 0 <= share <= 1 else []
+    return []
+
+
+def mirrored(model: Model, values: Values) -> float | None:
+    r"""Return the azimuth of the wind mirrored at the normal of a sheet at rest [degrees]; None if nothing is flat.
+
+    The pressure on a sheet with normal n depends on :math:`w \cdot n` and the speed, which the mirror image
+    :math:`2 (w \cdot n) n - w` leaves. Level with the ground, that is the azimuth :math:`2 \beta - \alpha`, with the
+    azimuth :math:`\beta` of n.
+    """
+    patches = model.scene.patches
+    normal = patches.normal.double()[:, :2]
+    weight = patches.area.double() / patches.area.double().sum()
+    shares, axes = torch.linalg.eigh((weight[:, None, None] * normal[:, :, None] * normal[:, None, :]).sum(0).cpu())
+    if not float(shares[-1]) >= FLAT:
+        return None
+    facing = math.degrees(math.atan2(float(axes[1, -1]), float(axes[0, -1])))
+    x, y, _ = flow_of((1.0, 0.0, 0.0), values)
+    azimuth = math.degrees(math.atan2(y, x))
+    other = 2 * facing - azimuth
+    return other if abs(turn(other - azimuth)) >= TURN else None
+
+
+def is_mirrored(model: Model, unknowns: Sequence[Unknown], place: Sequence[float], end: Sequence[float]) -> bool:
+    """True if the wind at the end of another start is about the mirror image of that at a place, both as shares."""
+    values, there = values_at(unknowns, place), values_at(unknowns, end)
+    other = mirrored(model, values) if "wind.azimuth" in values else None
+    return other is not None and abs(turn(there["wind.azimuth"] - other)) < MIRROR
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from gaussian_swaying.gaussians.measures import Gaussians
 from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.geometry.origin import Origin
 from gaussian_swaying.geometry.rotations import rotation_of
+from gaussian_swaying.inverse.plan import FILM_START
 from gaussian_swaying.inverse.tracks import ALIKE, GREY, alike, corners, follow, opencv, picture_of
-from gaussian_swaying.inverse.unknowns import FILM_START
 from gaussian_swaying.inverse.videos import Footage
 from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
 from gaussian_swaying.rendering.protocol import RenderOutput

@@ -19,8 +19,8 @@ from gaussian_swaying._files import write_json, write_table, write_text
 from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.gaussians.model import DeformedGaussians
 from gaussian_swaying.inverse.hand import Judged
+from gaussian_swaying.inverse.plan import SCALE, Unknown, of_simulation, values_at
 from gaussian_swaying.inverse.tracks import Tracks, opencv, picture_of
-from gaussian_swaying.inverse.unknowns import SCALE, Unknown, of_simulation, values_at
 from gaussian_swaying.inverse.videos import Footage
 from gaussian_swaying.recording.video import VideoEncoder
 from gaussian_swaying.rendering.protocol import RenderOutput

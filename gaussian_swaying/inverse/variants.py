@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 
 from gaussian_swaying._fixed import assign
-from gaussian_swaying.inverse.unknowns import FILM_START, OF_FILM, Values, model_of
+from gaussian_swaying.inverse.plan import FILM_START, OF_FILM, Values, model_of
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.simulation.measure import SimulationDiverged
 from gaussian_swaying.simulation.model import Model, number

@@ -19,12 +19,10 @@ import gaussian_swaying
 from gaussian_swaying.cli.fit import main
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.inverse import from_film
-from gaussian_swaying.inverse.film import open_film
-from gaussian_swaying.inverse.from_film import Seen, extent, longest_side, plan_text, upright_in
-from gaussian_swaying.inverse.plan import read_plan
+from gaussian_swaying.inverse.from_film import Seen, extent, longest_side, open_film, plan_text, upright_in
+from gaussian_swaying.inverse.plan import SCALE, read_plan
 from gaussian_swaying.inverse.registration import painter_of
 from gaussian_swaying.inverse.report import HELD_TINT, MOVING
-from gaussian_swaying.inverse.unknowns import SCALE
 from gaussian_swaying.inverse.videos import read_videos
 from gaussian_swaying.recording.video import VideoEncoder
 from gaussian_swaying.rendering.cameras.camera import look_at_camera, project

@@ -20,8 +20,7 @@ from gaussian_swaying.cli import sweep
 from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.config.parser import COMMON, OPTIONS
 from gaussian_swaying.gaussians.formats import FORMATS
-from gaussian_swaying.inverse.plan import read_plan
-from gaussian_swaying.inverse.unknowns import check_unknowns
+from gaussian_swaying.inverse.plan import check_unknowns, read_plan
 from gaussian_swaying.inverse.variants import states_of
 from gaussian_swaying.player.panel import Panel
 from gaussian_swaying.player.session import Session

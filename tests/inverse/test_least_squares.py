@@ -18,7 +18,7 @@ from gaussian_swaying.inverse.least_squares import (
     scale_of,
     solve,
 )
-from gaussian_swaying.inverse.unknowns import Unknown, check_apart, directions
+from gaussian_swaying.inverse.plan import Unknown, check_apart, directions
 
 TIME = torch.linspace(0, 1, 60, dtype=torch.float64)
 

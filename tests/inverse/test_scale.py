@@ -7,8 +7,8 @@ from shared import merged, peak, value_error
 from small_films import changed
 
 from gaussian_swaying.gaussians.ply import write_ply
+from gaussian_swaying.inverse.plan import SCALE, Unknown, check_unknowns
 from gaussian_swaying.inverse.report import scene_text
-from gaussian_swaying.inverse.unknowns import SCALE, Unknown, check_unknowns
 from gaussian_swaying.inverse.variants import states_of
 from gaussian_swaying.scenes.patches import box, to_cloud
 from gaussian_swaying.simulation.simulation import Simulation

@@ -10,8 +10,8 @@ from small_films import TRUTH
 
 from gaussian_swaying.inverse.evidence import Evidence, compare, compare_starts
 from gaussian_swaying.inverse.fit import Problem
+from gaussian_swaying.inverse.plan import FILM_START
 from gaussian_swaying.inverse.tracks import track
-from gaussian_swaying.inverse.unknowns import FILM_START
 from gaussian_swaying.inverse.variants import states_of
 from gaussian_swaying.inverse.videos import read_videos
 

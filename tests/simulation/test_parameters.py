@@ -8,9 +8,8 @@ import yaml
 from shared import beyond, double, peak, up_to, value_error
 from small_films import base
 
-from gaussian_swaying.inverse.plan import read_plan
+from gaussian_swaying.inverse.plan import Unknown, check_unknowns, read_plan
 from gaussian_swaying.inverse.report import scene_text
-from gaussian_swaying.inverse.unknowns import Unknown, check_unknowns
 from gaussian_swaying.inverse.variants import states_of
 from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
