@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -31,13 +30,12 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str]) -> int:
     """Parse the options and find the camera.
 
     Returns:
         0 on success, 2 on bad input or if the splat is not found in the film.
     """
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
     parser = build_parser()
     return run_command(
         lambda: write_camera(parser.parse_args(arguments)),

@@ -12,7 +12,7 @@ from gaussian_swaying.cli.errors import run_command
 from gaussian_swaying.interop.physgaussian import convert, to_yaml
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str]) -> int:
     """Write the YAML to a file or to standard output; 2 on bad input."""
     parser = argparse.ArgumentParser(
         prog=program.name("convert"),

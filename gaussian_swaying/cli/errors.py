@@ -50,7 +50,7 @@ def run_command(
     stopped: str = "Stopped.",
     memory: str = "fewer Gaussians or smaller pictures",
     expected: tuple[type[BaseException], ...] = (),
-    arguments: Sequence[str] | None = None,
+    arguments: Sequence[str] = (),
     advice: Callable[[BaseException], str | None] | None = None,
 ) -> int:
     """Run a command, and turn exceptions into a sentence on standard error and an exit code.
@@ -59,7 +59,7 @@ def run_command(
 
     Args:
         command: Does the work and gives an exit code; None is 0.
-        arguments: Command line, for messages; that of the process if None.
+        arguments: Command line, for messages.
         advice: Returns an additional message after an error or stop, or None.
 
     Returns:
@@ -67,7 +67,6 @@ def run_command(
         another signal that stopped it, 1 for a bug. With the environment variable ``GAUSSIAN_SWAYING_DEBUG=1`` errors
         keep their traceback.
     """
-    arguments = sys.argv[1:] if arguments is None else arguments
 
     def tell(text: str, error: BaseException) -> None:
         for line in (text, advice and advice(error)):

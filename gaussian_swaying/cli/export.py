@@ -5,7 +5,7 @@ With ``--web``, a recorded run becomes a film that a browser plays: ``gaussian-s
 """
 
 import argparse
-import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -59,17 +59,16 @@ def build_options() -> argparse.ArgumentParser:
     return parser
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main(arguments: Sequence[str]) -> int:
     """Parse and convert; 2 on bad input."""
-    given = sys.argv[1:] if arguments is None else arguments
 
     def act() -> None:
-        if "--live-web" in given:
+        if "--live-web" in arguments:
             from gaussian_swaying.cli.live_web import export_live_web  # a conversion needs no simulation
 
-            export_live_web(given)
+            export_live_web(arguments)
         else:
-            export(build_options().parse_args(given))
+            export(build_options().parse_args(arguments))
 
     return run_command(act, stopped="Stopped; nothing was written.", memory="fewer Gaussians")
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -41,13 +40,13 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str]) -> int:
     """Parse and fit.
 
     Returns:
         0 on success, 2 on bad input or if the video cannot tell the unknowns apart, 130 after Ctrl-C, 143 by SIGTERM.
     """
-    arguments = joined(sys.argv[1:] if arguments is None else arguments)
+    arguments = joined(arguments)
     parser, begun = build_parser(), list[str]()
 
     def after(error: BaseException) -> str | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 import webbrowser
 from collections.abc import Sequence
@@ -42,16 +41,8 @@ def build_options() -> argparse.ArgumentParser:
     return parser
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Serve the page until Ctrl-C.
-
-    Args:
-        arguments: Command line; that of the process if None.
-
-    Returns:
-        0 after Ctrl-C, 2 on bad input.
-    """
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
+def main(arguments: Sequence[str]) -> int:
+    """Serve the page until Ctrl-C; 2 on bad input."""
     return run_command(
         lambda: _live(arguments),
         memory="a smaller `scene.region`, a coarser `solver.dx` or fewer `--pixels`",

@@ -73,7 +73,7 @@ def run(command: str | None = None) -> NoReturn:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal without the sign for cubic metres
     try:
-        sys.exit(main() if command is None else _imported(COMMANDS[command][0]).main())
+        sys.exit(main() if command is None else _imported(COMMANDS[command][0]).main(sys.argv[1:]))
     except KeyboardInterrupt:  # while options are read
         _stop(signal.SIGINT, None)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from argparse import ArgumentError
 from collections.abc import Sequence
@@ -55,9 +54,9 @@ def build_options() -> argparse.ArgumentParser:
     return parser
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str]) -> int:
     """Preview, print the report and write the files."""
-    arguments = joined(sys.argv[1:] if arguments is None else arguments)
+    arguments = joined(arguments)
     parser = build_options()
     return run_command(
         lambda: print("\n".join(_preview(parser.parse_args(with_shipped(arguments, "sim"))))),

@@ -20,9 +20,8 @@ if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str]) -> int:
     """Parse, build, run."""
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
     parser = Simulation.parser()
     started: list[Simulation] = []
 

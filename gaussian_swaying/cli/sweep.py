@@ -44,9 +44,8 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str]) -> int:
     """Parse and sweep."""
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
     parser = build_parser()
     return run_command(
         lambda: sweep(parser.parse_args(arguments), arguments),

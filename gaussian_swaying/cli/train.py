@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -35,14 +34,9 @@ class _Command(TrainCLI):
             super().parse_arguments(parser, args)
 
 
-def make_cli(arguments: Sequence[str] | None = None, run: bool = True, run_folder: RunFolder | None = None) -> TrainCLI:
-    """Parse a command line and, with ``run``, do its subcommand; without, it has none.
-
-    Args:
-        arguments: Command line; that of the process if None.
-    """
+def make_cli(arguments: Sequence[str], run: bool = True, run_folder: RunFolder | None = None) -> TrainCLI:
+    """Parse a command line and, with ``run``, do its subcommand; without, it has none."""
     limit_yaml(lambda found: with_named_materials(refuse_gone(found)))
-    given = with_lists(with_shipped(sys.argv[1:] if arguments is None else arguments, "train"))
     kwargs = {"prog": program.name("train"), "exit_on_error": False}
     return _Command(
         SplatTrainer,
@@ -53,21 +47,21 @@ def make_cli(arguments: Sequence[str] | None = None, run: bool = True, run_folde
         save_config_callback=None,  # the run folder writes it, once training has started
         run_folder=run_folder,
         parser_kwargs=kwargs | {"description": "Train surface-aligned Gaussians from photos."},
-        args=given,
+        args=with_lists(with_shipped(arguments, "train")),
         run=run,
     )
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str]) -> int:
     """Parse and run."""
-    run_folder, given = RunFolder(), sys.argv[1:] if arguments is None else list(arguments)
+    run_folder = RunFolder()
 
     def how_to_continue(error: BaseException) -> str | None:
         path = run_folder.newest()
         if path is None:
             return None
         path = os.path.relpath(path) if Path(path).is_relative_to(Path.cwd()) else path
-        again = command(given, "--ckpt_path", path, without="--ckpt_path")
+        again = command(arguments, "--ckpt_path", path, without="--ckpt_path")
         return f"{path} is the last checkpoint; to continue:\n  {again}"
 
     return run_command(
@@ -75,12 +69,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         stopped="Stopped.",
         memory="smaller images (`data.init_args.downscale`)",
         expected=(TrainingDiverged, MisconfigurationException),
-        arguments=given,
+        arguments=arguments,
         advice=how_to_continue,
     )
 
 
-def _train(arguments: Sequence[str] | None, run_folder: RunFolder) -> int:
+def _train(arguments: Sequence[str], run_folder: RunFolder) -> int:
     warnings.filterwarnings("ignore", category=PossibleUserWarning)
     for message in ("Using ModelCheckpoint with manual optimization", "You're resuming from a checkpoint that ended"):
         warnings.filterwarnings("ignore", message=f"(?s)\\s*{message}")

@@ -17,7 +17,7 @@ from gaussian_swaying.cli.errors import run_command
 FRAMES = 3  # the second records CUDA graphs, and the third replays them
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str]) -> int:
     """Compile the kernels of some configurations; 2 on bad input."""
     parser = argparse.ArgumentParser(
         prog=program.name("warm"),

@@ -62,7 +62,6 @@ from gaussian_swaying.inverse.report import (
     Fit,
     consequences,
     predictions,
-    wind_seen,
     write_before,
     write_page,
     write_results,
@@ -440,7 +439,6 @@ class Problem:
             tuple(self.notes()),
             explained(self.simulation, self.videos, self.tracks, values, self.fitted),
             consequences(self.plan.assumed, values, self.simulation),
-            wind_seen(values, self.videos, self.simulation),
             self.judged,
             self.others(course.place, course.rivals),
         )

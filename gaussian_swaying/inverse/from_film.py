@@ -213,11 +213,9 @@ def held_end(places: Tensor, moved: Tensor, up: Sequence[float]) -> tuple[str, f
     if len(moved) < 4 * FEWEST or (others := float(moved.quantile(0.75))) < LEAST_MOTION:
         return None
     upward = torch.nn.functional.normalize(torch.as_tensor(up, dtype=torch.float64), dim=0)
-    ends = {"top": upward, "bottom": -upward}
-    for axis, name in enumerate("xyz"):
-        if abs(float(upward[axis])) < 0.7:
-            unit = torch.eye(3, dtype=torch.float64)[axis]
-            ends |= {f"+{name}": unit, f"-{name}": -unit}
+    axes = {name: torch.tensor(axis, dtype=torch.float64) for name, axis in DIRECTIONS.items()}
+    ends = {name: axis for name, axis in axes.items() if abs(float(upward @ axis)) < 0.7}
+    ends |= {"top": upward, "bottom": -upward}
     along = {name: places @ direction for name, direction in ends.items()}
     length = {name: float(own.max() - own.min()) for name, own in along.items()}
     found = []
@@ -431,11 +429,11 @@ def _shown(seen: Seen, video: Footage, preview: Suggestion, wanted: dict[str, An
 
 def upright_in(camera: Camera, guess: Sequence[float]) -> list[float] | None:
     """The direction of a splat, an axis if one is near, that is up in a film; None if a guess (3,) is, too."""
-    up = -camera.world_to_camera[1, :3].double()
-    if float(up @ torch.tensor(guess, dtype=torch.float64)) > UPRIGHT:
+    up = (-camera.world_to_camera[1, :3]).numpy(force=True).astype(float)
+    if up @ guess > UPRIGHT:
         return None
-    best = max(DIRECTIONS.values(), key=lambda axis: float(up @ torch.tensor(axis, dtype=torch.float64)))
-    return list(best) if float(up @ torch.tensor(best, dtype=torch.float64)) > NEARLY else up.tolist()
+    best = max(DIRECTIONS.values(), key=lambda axis: float(up @ axis))
+    return list(best) if up @ best > NEARLY else up.tolist()
 
 
 def longest_side(name: str, metres: float, seen: Seen, preview: Suggestion) -> float:

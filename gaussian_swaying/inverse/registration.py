@@ -17,11 +17,10 @@ from gaussian_swaying.gaussians.harmonics import SH_DC
 from gaussian_swaying.gaussians.measures import Gaussians
 from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.geometry.origin import Origin
-from gaussian_swaying.geometry.rotations import rotation_of
 from gaussian_swaying.inverse.plan import FILM_START
 from gaussian_swaying.inverse.tracks import ALIKE, GREY, alike, corners, follow, opencv, picture_of
 from gaussian_swaying.inverse.videos import Footage
-from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
+from gaussian_swaying.rendering.cameras.camera import Camera, orbit_camera
 from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.suggestion.up import guess_up
@@ -83,26 +82,11 @@ def register(
 
 
 def cameras_around(
-    center: Sequence[float] | Tensor,
-    distance: float,
-    up: Sequence[float] | Tensor,
-    fov_y_degrees: float,
-    width: int,
-    height: int,
-    count: int = 12,
-    elevations: Sequence[float] = (0.0, 30.0),
+    center: Sequence[float] | Tensor, distance: float, up: Sequence[float] | Tensor, fov: float, width: int, height: int
 ) -> list[Camera]:
-    """Cameras around an object at a distance [scene units], so many at each elevation [degrees], to start with."""
-    middle = torch.as_tensor(center, dtype=torch.float64)
-    axis = torch.nn.functional.normalize(torch.as_tensor(up, dtype=torch.float64), dim=0)
-    first = torch.linalg.cross(axis, torch.eye(3, dtype=torch.float64)[int(axis.abs().argmin())])
-    found = []
-    for elevation in map(math.radians, elevations):
-        for turn in (2 * math.pi * k / count for k in range(count)):
-            level = rotation_of((turn * axis)[None])[0] @ torch.nn.functional.normalize(first, dim=0)
-            eye = middle + distance * (math.cos(elevation) * level + math.sin(elevation) * axis)
-            found.append(look_at_camera(eye, middle, axis, fov_y_degrees, width, height, dtype=torch.float64))
-    return found
+    """Cameras around an object at a distance [scene units] from which a registration may start."""
+    turns = ((azimuth, elevation) for elevation in (0.0, 30.0) for azimuth in range(0, 360, 30))
+    return [orbit_camera(center, up, distance, *turn, fov, width, height, dtype=torch.float64) for turn in turns]
 
 
 def fov_of(camera: Camera) -> float:

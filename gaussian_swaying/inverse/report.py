@@ -60,7 +60,6 @@ class Fit:
         notes: What the videos say against the plan.
         followed: For each camera the share of the motion of its held-out tracks that is explained, 0 to 1.
         assumed: What the values rest on that nobody measured.
-        seen: Where the wind blows, as each camera sees it.
         judged: What the background says of each video.
         rivals: Other values that fit nearly as well.
     """
@@ -75,7 +74,6 @@ class Fit:
     notes: Sequence[str] = ()
     followed: Mapping[str, float] = field(default_factory=dict)
     assumed: Sequence[str] = ()
-    seen: Sequence[str] = ()
     judged: Sequence[Judged] = ()
     rivals: Sequence[Mapping[str, float]] = ()
 
@@ -160,7 +158,7 @@ class Fit:
         for one in self.shown:
             told = "" if math.isnan(one.predicted) else f", predicted frames {one.predicted:.2f} dB"
             lines.append(f"camera {one.camera}: fitted frames {one.fitted:.2f} dB{told}")
-        lines += [*self.seen, *(sentence for one in self.judged for sentence in one.sentences())]
+        lines += [sentence for one in self.judged for sentence in one.sentences()]
         failed, doubtful = self.doubts()
         said = {"good": "This fit is good.", "doubtful": "This fit is doubtful:", "failed": "This fit has failed:"}
         lines += [said[self.verdict], *failed, *doubtful]
@@ -268,22 +266,6 @@ def consequences(assumed: Sequence[str], values: Mapping[str, float], simulation
             f"The mass was taken as {area:.3g} kg/m². With twice the mass the speed is about 1.4 times and E twice as "
             "large: weigh it, and set material.density."
         )
-    return found
-
-
-def wind_seen(values: Mapping[str, float], videos: Sequence[Footage], simulation: Simulation) -> list[str]:
-    """Sentences on where the wind blows in the picture of each camera; none if no direction was sought."""
-    if not {"wind.azimuth", "wind.elevation"} & set(values):
-        return []
-    flow = torch.tensor(flow_of(simulation.wind.flows[0].tolist(), values)).double()  # type: ignore[index]
-    scene, found = flow @ simulation.scene.frame.rotation.double().cpu() / flow.norm(), []
-    for video in videos:
-        right, down, away = (video.cameras[0].world_to_camera[:3, :3].double().cpu() @ scene).tolist()
-        ways = [f"to the {'right' if right > 0 else 'left'}"] * (abs(right) > 0.1)
-        ways += ["down" if down > 0 else "up"] * (abs(down) > 0.2)
-        angle = math.degrees(math.asin(min(1.0, abs(away))))
-        ways.append(f"{angle:.0f} degrees {'away from' if away > 0 else 'towards'} it")
-        found.append(f"camera {video.name} sees the wind blow {', '.join(ways)}")
     return found
 
 

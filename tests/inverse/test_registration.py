@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 from handheld_films import tripod, write_film
-from shared import double, randn, seeded, value_error
+from shared import randn, seeded, value_error
 from small_films import changed
 
 from gaussian_swaying import Simulation
@@ -68,7 +68,7 @@ def test_from_a_camera_that_is_near(draw, frame, truth):
 
 
 def test_from_no_camera(draw, frame, truth):
-    around = cameras_around(MIDDLE, 2.2, UP, FOV, WIDTH, HEIGHT, count=8, elevations=(10.0,))
+    around = cameras_around(MIDDLE, 2.2, UP, FOV, WIDTH, HEIGHT)
     angle, distance = _off(find_camera(draw, frame, around).camera, truth)
     assert angle < 0.5
     assert distance < 0.01
@@ -79,13 +79,6 @@ def test_with_the_focal_length(draw, frame, truth):
     found = find_camera(draw, frame, [near], focal=True).camera
     assert float(found.intrinsics[0, 0] / truth.intrinsics[0, 0]) == pytest.approx(1, abs=0.03)
     assert _off(found, truth)[0] < 0.7
-
-
-def test_cameras_around_look_at_the_middle():
-    for camera in cameras_around(MIDDLE, 2.0, UP, FOV, WIDTH, HEIGHT, count=4):
-        local = camera.world_to_camera[:3, :3] @ MIDDLE.double() + camera.world_to_camera[:3, 3]
-        torch.testing.assert_close(local, double([0.0, 0.0, 2.0]), atol=1e-9, rtol=0)
-        assert float(camera.world_to_camera[1, 2]) < 0  # z up is up in the picture
 
 
 def test_what_cannot_be_found_is_refused(draw, truth):

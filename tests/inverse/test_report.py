@@ -12,9 +12,7 @@ from small_films import changed
 from gaussian_swaying.inverse.fit import STEPS, UNSETTLED, run_fit
 from gaussian_swaying.inverse.least_squares import Block, solve
 from gaussian_swaying.inverse.plan import Unknown
-from gaussian_swaying.inverse.report import Fit, Shown, consequences, wind_seen
-from gaussian_swaying.inverse.videos import Footage
-from gaussian_swaying.rendering.cameras.camera import look_at_camera
+from gaussian_swaying.inverse.report import Fit, Shown, consequences
 
 from .test_least_squares import scaled
 
@@ -91,26 +89,6 @@ def test_a_whole_fit_tells_it_and_goes_on(plan_of, tmp_path, brief, monkeypatch)
     assert len(again.history) > len(first.history)
     assert again.unsettled == ""
     assert again.values["wind.speed"] == pytest.approx(5.0, rel=0.05)
-
-
-def _camera(eye):
-    camera = look_at_camera(eye, (0.0, 0.0, 0.0), (0, 0, 1), 38.0, 20, 10)
-    return Footage("a", (0.0,), (camera,), torch.zeros(1, 10, 20, 3, dtype=torch.uint8))
-
-
-@pytest.mark.parametrize(
-    ("eye", "azimuth", "elevation", "told"),
-    [
-        ((0.0, -3.0, 0.0), 60.0, 0.0, "to the right, 60 degrees away from it"),
-        ((0.0, 3.0, 0.0), 60.0, 0.0, "to the left, 60 degrees towards it"),
-        ((3.0, 0.0, 0.0), 90.0, 30.0, "to the right, up, 0 degrees"),
-    ],
-)
-def test_where_the_wind_blows_in_a_picture(simulation, eye, azimuth, elevation, told):
-    values = {"wind.speed": 3.0, "wind.azimuth": azimuth, "wind.elevation": elevation}
-    (sentence,) = wind_seen(values, [_camera(eye)], simulation)
-    assert told in sentence
-    assert wind_seen({"material.E": 1.0}, [_camera(eye)], simulation) == []
 
 
 def test_what_follows_from_what_was_not_measured(simulation, tmp_path):
