@@ -51,13 +51,11 @@ def read_axis(name: str, given: Any) -> Axis:
             f"Expected `{where}` to be a list of values, not empty, a range such as {{from: 1, to: 9, count: 5}}, or a "
             f"draw such as {{draw: uniform, low: 1, high: 9}}, but got {given!r}: for one value write [{given}]."
         )
-    drawn, fields = "draw" in given, tuple[str, ...](("from", "to", "count", "scale"))
-    kind = given.get("draw", given.get("scale", "linear"))
-    if drawn:
-        check_choice(f"{where}.draw", kind, ("uniform", "log", "integer", "choice"))
-        fields = ("draw", "of") if kind == "choice" else ("draw", "low", "high")
-    else:
-        check_choice(f"{where}.scale", kind, ("linear", "log"))
+    drawn, kind = "draw" in given, given.get("draw", given.get("scale", "linear"))
+    ends = ("low", "high") if drawn else ("from", "to")
+    fields = ("draw", "of") if kind == "choice" else ("draw", *ends) if drawn else (*ends, "count", "scale")
+    kinds = ("uniform", "log", "integer", "choice") if drawn else ("linear", "log")
+    check_choice(f"{where}.{'draw' if drawn else 'scale'}", kind, kinds)
     for entry in given:
         if entry not in fields:
             raise ValueError(f"`{where}` has an unknown entry `{entry}`: use {', '.join(fields)}.")
@@ -66,7 +64,6 @@ def read_axis(name: str, given: Any) -> Axis:
         if not isinstance(choices, list) or not choices:
             raise ValueError(f"Expected `{where}.of` to be a list of values to choose from, but got {choices!r}.")
         return lambda stream: choices[stream.randrange(len(choices))]
-    ends = ("low", "high") if drawn else ("from", "to")
     low, high = (_finite(f"{where}.{end}", given.get(end)) for end in ends)
     if kind == "log" and min(low, high) <= 0:
         raise ValueError(
@@ -135,13 +132,9 @@ class Sweep(NamedTuple):
 
 @dataclass(frozen=True)
 class Plan:
-    """A sweep whose settings were checked.
+    """A sweep whose settings were checked: the YAML that the runs share, and the value of every axis in each.
 
-    Args:
-        config: The whole configuration that the runs share, as YAML.
-        frames: Frames of a run, unless it is an axis.
-        runs: The value of every axis in each run.
-        splats: SHA-256 of every splat file that a run reads, by its path.
+    ``frames`` are those of a run, unless it is an axis; ``splats`` the SHA-256 of the files that they read, by path.
     """
 
     config: str
@@ -217,14 +210,11 @@ def parse_run(parser: ArgumentParser, config: str, frames: int, run: Mapping[str
 def _telling(runs: Sequence[Mapping[str, Any]]) -> list[int]:
     """The runs in which a value appears for the first time; of more than a hundred seeds or draws, the first."""
     many = {name: len({json.dumps(run[name]) for run in runs}) == len(runs) > 100 for name in runs[0]}
-    seen: set[tuple[str, str]] = set()
-    numbers = []
+    first: dict[tuple[str, str], int] = {}
     for number, run in enumerate(runs):
-        new = {(name, "" if many[name] else json.dumps(value)) for name, value in run.items()} - seen
-        if new:
-            seen |= new
-            numbers.append(number)
-    return numbers
+        for name, value in run.items():
+            first.setdefault((name, "" if many[name] else json.dumps(value)), number)
+    return sorted(set(first.values()))
 
 
 def _options(file: Path, field_: str, given: Any) -> dict[str, Any]:

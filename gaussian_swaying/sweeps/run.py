@@ -107,8 +107,7 @@ def _parser() -> ArgumentParser:
 def work(job: Job, threads: int, explain: Explain, where: str = platform.node()) -> Outcome:
     """Do a job in a worker and write the results of its complete runs; the caller writes those of failures."""
     torch.set_num_threads(threads)
-    told = io.StringIO()
-    results, status, ready = dict[str, dict[str, Any]](), "failed", True
+    told, status, ready = io.StringIO(), "failed", True
     try:
         with stop_signals(), redirect_stdout(told), redirect_stderr(told):
             summaries = run_alone(job) if len(job.names) == 1 else run_together(job)
