@@ -74,7 +74,7 @@ def run_health(stepper: Stepper, log: Sequence[Mapping[str, Any]]) -> tuple[dict
     elastic = points.elastic
     size = scene.size * scene.frame.metres_per_unit
     found = extremes(log, where, size, None if elastic is None else elastic.cpu())
-    told = advice(found, float(points.youngs_modulus.amax()), scene.filled == 0)
+    told = advice(found, float(points.youngs_modulus.amax()), scene.filled == 0, len(stepper.solver.boundaries) > 0)
     told += coarse(size, stepper.solver.dx)
     if scene.filled == 0 and found["moved"] is not None:
         told += narrow(points.position.reshape(-1, 3).cpu(), stepper.solver.dx, found["moved"]["share"])
