@@ -93,10 +93,10 @@ def write_preview(
     if simulation.scene.loose and verbose:
         specks = f"{simulation.scene.loose:,} specks hang on nothing or by a thread"
         lines.append(f"  note: {specks}; they follow their nearest neighbours (scene.loose: carry)")
-    lines += [f"  {line}" for line in _doubts(found)]
+    lines += [f"  {line}" for line in doubts(found)]
     lines += run_lines(simulation) + cost_lines(cost) if verbose else []
     film = f"{frames * FRAME_DT:.3g} s at {PICTURE[0]} x {PICTURE[1]}"
-    run = program.command("sim", "--config", folder / "starter.yaml", "--output", Path("outputs") / splat_name(splat))
+    run = program.command("sim", "--config", folder / "starter.yaml", "--output", Path("outputs") / folder.name)
     lines += [f"the starter ({film}, {duration(cost.total_seconds)} here):", f"  {run}"]
     names = ["preview.json", "preview.png", *(["things.png"] if things is not None else []), *names]
     return [*lines, _wrote(folder, names, verbose)]
@@ -124,8 +124,8 @@ def _write_numbers(folder: Path, cost: Cost, **more: Any) -> None:
     (folder / "preview.json").write_text(text + "\n", encoding="utf-8")
 
 
-def _doubts(found: Suggestion) -> list[str]:
-    """Warnings about weak guesses, each with the option that replaces it."""
+def doubts(found: Suggestion) -> list[str]:
+    """Warnings about guesses that are weak or disappoint, each with the option that replaces it."""
     lines: list[str] = []
     count, box = int(found.moving.simulated.sum()), found.moving.box
     if found.moving.confidence == "low" and box is not None:
@@ -137,6 +137,8 @@ def _doubts(found: Suggestion) -> list[str]:
         if guess.confidence == "low":
             other = "".join(f"; the next best is --{name} {value}" for value in guess.options[1:])
             lines.append(f"warning: {what} a weak guess: check the picture{other}")
+    if found.kind == "rigid":
+        lines.append("note: little of it sways; if it hangs, add --kind hanging")
     return lines
 
 
