@@ -41,7 +41,7 @@ from gaussian_swaying.simulation.simulation import RecordedRun
 
 TAKEN = {
     "a film": "",
-    "the frames of a run": "apart spz_version fps box bones",
+    "the frames of a run": "apart spz_version fps box bones proxy",
     "a splat": "up metres_per_unit spz_version",
 }
 """The options of each kind of export; a format may have fewer."""
@@ -76,6 +76,7 @@ def build_options() -> argparse.ArgumentParser:
     box = ("X0", "Y0", "Z0", "X1", "Y1", "Z1")
     add("--box", nargs=6, type=float, metavar=box, help="write only the Gaussians that are in this box at rest")
     add("--bones", type=int, help="write a run as one .glb, a skin with so many bones (48 is good for most)")
+    add("--proxy", action="store_true", default=None, help="with --bones, write a mesh that moves instead of Gaussians")
     add("--up", nargs=3, type=float, metavar=("X", "Y", "Z"), help="up in the scene, for USD and glTF; default: z")
     add("--metres-per-unit", type=float, help="length of a scene unit [m], for USD and glTF; default: 1")
     add("--spz-version", type=int, choices=WRITTEN, help="of an .spz file; default: 3, which most programs read")
@@ -107,8 +108,8 @@ def export(options: argparse.Namespace) -> None:
     what = "a film" if plays else "the frames of a run" if Path(options.source).is_dir() else "a splat"
     format = None if plays else FORMATS[format_of(options.target)]
     known = () if format is None else (*format.options, "apart", "fps", "box", *(["up"] if format.in_metres else []))
-    known = (*known, "bones") if format is FORMATS["glb"] else known
-    for name in ("up", "metres_per_unit", "spz_version", "apart", "fps", "box", "bones"):
+    known = (*known, "bones", "proxy") if format is FORMATS["glb"] else known
+    for name in ("up", "metres_per_unit", "spz_version", "apart", "fps", "box", "bones", "proxy"):
         if vars(options)[name] is not None and name not in {*TAKEN[what].split()}.intersection(known):
             where = f" as {Path(options.target).suffix}" if format else ""
             raise ValueError(f"--{name.replace('_', '-')} is not for {what}{where}: leave it out.")
@@ -155,6 +156,8 @@ def export_run(options: argparse.Namespace, format: Format, place: dict[str, Any
         raise ValueError("--box holds no Gaussian of the run: enlarge it, or leave it out.")
     if options.apart and (options.box is not None or options.bones is not None):
         raise ValueError("--apart cannot be combined with --box or --bones: leave it out.")
+    if options.proxy and options.bones is None:
+        raise ValueError("--proxy is a mesh that bones move: give their number, as in --bones 48.")
     motion = islice(run.frames(), 0, None, every)
     if options.bones is not None:
         return export_bones(options, target, motion, scene, inside, fps / every, place)
@@ -190,7 +193,7 @@ def export_bones(
     bones = replace(bones, index=index[inside], weight=weight[inside])
     del place["spz_version"]
     with atomic(target) as temporary:
-        temporary.write_bytes(encode_skinned_gltf(cloud.select(inside), bones, fps, **place))
+        temporary.write_bytes(encode_skinned_gltf(cloud.select(inside), bones, fps, **place, proxy=options.proxy))
     print(f"{options.bones} bones, {error:.2%} of the motion missed")
     if cloud.sh_degree:
         print("note: colours that depend on the direction of view are the same from all sides.")
