@@ -151,8 +151,8 @@ def newton_mpm(names: Names, axes: Any) -> None:
     """The post from its side, six times beside each other."""
     for k, frame in enumerate(names["moved"][::10]):
         axes.scatter(frame[:, 1] + 0.3 * k, frame[:, 2], s=1, c=names["means"][:, 0], cmap="viridis")
-        axes.text(0.3 * k, -0.05, f"{0.2 * k:.1f} s", ha="center")
-    axes.set(aspect="equal", xlabel="y [m], shifted", ylabel="z [m]", ylim=(-0.09, 0.55))
+        axes.text(0.3 * k, 0.52, f"{0.2 * k:.1f} s", ha="center")
+    axes.set(aspect="equal", xlabel="y [m], shifted", ylabel="z [m]", ylim=(-0.02, 0.58))
 
 
 def sand(names: Names, axes: Any) -> None:
