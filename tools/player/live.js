@@ -36,6 +36,7 @@ class Live {
     this.view = new View(canvas, { draws: tested !== null });
     const action = (kind, text, label) => button(kind, text, label, () => this.say({ kind }));
     const further = [action("step", "Step", "Advance by one step"), action("undo", "Undo", "Take the last change back")];
+    further.push(button("curves", "Timeline", "Speed, direction and gusts over time", () => this.openTimeline(element("timeline").hidden)));
     this.tunnel = new Tunnel(this.view, (message) => this.say(message), (name, value) => this.set(name, value), further);
     this.brush = new Brush(this.view, (message) => this.say(message));
     this.own = { show: "color", server: false, part: "held", radius: 20, through: false, how: "what is connected" };
@@ -135,6 +136,11 @@ class Live {
     element("note").hidden = !sentence;
   }
 
+  openTimeline(on) {
+    element("timeline").hidden = !on;
+    element("curves").setAttribute("aria-expanded", String(on));
+  }
+
   showFigures(figures) {
     this.figures = figures;
     const { loading, notice, problem, broken, paused, speed, rate, pictures, stretch } = figures;
@@ -186,6 +192,8 @@ class Live {
     ];
     groups.push({ name: "Files", controls: files, shut: true });
     this.tunnel.show(groups);
+    element("curves").disabled = !this.tunnel.panel.timeline;
+    if (!this.tunnel.panel.timeline) this.openTimeline(false);
     this.brush.set({ on: painting?.on ?? false, ...own });
     this.showLegend();
     if (this.hash !== undefined) return;
@@ -225,7 +233,7 @@ class Live {
     else if (name === "load") this.file.click();
     else if (["parts.npz", "live.yaml"].includes(name)) this.download(name);
     else this.say({ kind: "set", name, value });
-    if (value === null || name === "paint") this.tunnel.changed.delete(name);
+    if (value === null || ["paint", "wind.schedule"].includes(name)) this.tunnel.changed.delete(name);
   }
 
   download(name) {
