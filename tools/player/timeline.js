@@ -6,6 +6,7 @@ const [HIGH, GAP, LEFT, RIGHT, AXIS] = [44, 8, 98, 12, 18]; // pixels: of a trac
 const SHORTEST = 10; // s
 const RADIUS = 6; // pixels, of a key
 const APART = 0.01; // s between two keys of a track, at least
+const PATIENCE = 3000; // ms in which a change is taken, or refused
 const MOVES = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }; // s, and hundredths of a track
 const HINT = "Double click adds a key, dragging moves it, right click or Delete removes it. Reset plays from the start.";
 
@@ -35,7 +36,9 @@ export class Timeline {
   /** Show keys: of each track pairs of time [s] and value, and the value of a track without. */
   show(value) {
     const text = JSON.stringify(value);
-    if (this.held || text === this.text) return; // another picture would end a double click
+    this.told = value;
+    if (JSON.stringify(value.keys) === this.sent) this.sent = null;
+    if (this.held || this.sent || text === this.text) return; // another picture would end a double click
     Object.assign(this, { value, text });
     const last = Math.max(0, ...Object.values(value.keys).flat().map(([time]) => time));
     this.length = Math.max(SHORTEST, Math.ceil(1.25 * last));
@@ -138,9 +141,18 @@ export class Timeline {
     this.draw();
   }
 
+  // Tell all keys; what the server says before it has taken them is older.
   give() {
-    this.show(this.value);
-    this.changed(this.value);
+    const told = this.value;
+    this.sent = null;
+    this.show(told);
+    this.sent = JSON.stringify(told.keys);
+    clearTimeout(this.waiting);
+    this.waiting = setTimeout(() => {
+      this.sent = null;
+      this.show(this.told);
+    }, PATIENCE);
+    this.changed(told);
   }
 
   // ---- the picture
