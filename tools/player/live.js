@@ -7,6 +7,7 @@ import { View } from "./view.js";
 
 const SLOW = 3; // pictures a second; a browser that draws fewer gets pictures from the server
 const PATIENCE = 4000; // ms, until that is decided
+const NARROW = 1100; // pixels, as in player.html
 const AGAIN = 1000; // ms until a connection that broke is opened again
 
 // ---- messages, see gaussian_swaying/player/server.py
@@ -138,6 +139,7 @@ class Live {
 
   openTimeline(on) {
     element("timeline").hidden = !on;
+    if (on && innerWidth <= NARROW) this.tunnel.open(false); // there is room for one
     element("curves").setAttribute("aria-expanded", String(on));
   }
 
