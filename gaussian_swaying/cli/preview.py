@@ -125,7 +125,7 @@ def preview_scene(options: argparse.Namespace, folder: Path) -> list[str]:
     lines += [f"  {line}" for line in doubts(found)]
     lines += run_lines(simulation) + cost_lines(cost) if options.verbose else []
     film = f"{options.frames * FRAME_DT:.3g} s at {PICTURE[0]} x {PICTURE[1]}"
-    where = Path("outputs") / splat_name(options.scene)
+    where = Path("outputs") / (Path(options.output).name if options.output else splat_name(options.scene))
     lines.append(f"the starter ({film}, {duration(cost.total_seconds)} here):")
     lines.append("  " + program.command("sim", "--config", folder / "starter.yaml", "--output", where))
     return [*lines, _wrote(folder, names, options.verbose)]
@@ -164,7 +164,7 @@ def _write_numbers(folder: Path, cost: Cost, **more: Any) -> None:
 
 
 def doubts(found: Suggestion) -> list[str]:
-    """Warnings about weak guesses, each with the option that replaces it."""
+    """Warnings about guesses that are weak or disappoint, each with the option that replaces it."""
     lines: list[str] = []
     count, box = int(found.moving.simulated.sum()), found.moving.box
     if found.moving.confidence == "low" and box is not None:
@@ -176,6 +176,8 @@ def doubts(found: Suggestion) -> list[str]:
         if guess.confidence == "low":
             other = "".join(f"; the next best is --{name} {value}" for value in guess.options[1:])
             lines.append(f"warning: {what} a weak guess: check the picture{other}")
+    if found.kind == "rigid":
+        lines.append("note: little of it sways; if it hangs, add --kind hanging")
     return lines
 
 

@@ -65,9 +65,11 @@ def _simulate(parser: ArgumentParser, arguments: Sequence[str], started: list[Si
     extra: dict[str, Any] = {"config": [str(file) for file in settings.config or []]}
     started.append(simulation)
     with stop_signals():
-        summary = simulation.run(folder, resume=settings.resume, settings=extra)
+        summary = simulation.run(folder, resume=settings.resume, settings=extra, certify=settings.certify)
     seconds = ", ".join(f"{part} {value:.1f} s" for part, value in summary["wall_s"].items())
     print(f"{summary['frames']} frames, {summary['substeps']:,} substeps: {seconds}")
+    if settings.certify:
+        print(summary["certificate"]["sentence"])
     if summary["torn_particles"]:
         print(
             f"warning: {summary['torn_particles']} particles are farther than two cells from a neighbour, so the "

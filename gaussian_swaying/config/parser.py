@@ -39,7 +39,7 @@ CAMERA_PATHS = (CaptureCamera,)
 EFFECTS = (FrozenWind, Shelter, Turbulence)
 # options that a configuration file cannot contain; settings that may change when a run is resumed
 COMMAND_LINE_ONLY = ("preset",)
-RUN_ONLY = ("config", "output", "device", "frames", "resume")
+RUN_ONLY = ("config", "output", "device", "frames", "resume", "certify")
 # constructor arguments that a YAML file sets within a component instead; components that may be null
 PYTHON_ONLY = ("up", "hold", "renderer", "cloud")
 NULLABLE = ("air", "contact", "normalisation")
@@ -99,6 +99,12 @@ def build_parser(schema: type) -> ArgumentParser:
         action=ActionYesNo(no_prefix=None),  # type: ignore[arg-type]
         default=False,
         help="Continue the run found in the output folder.",
+    )
+    parser.add_argument(
+        "--certify",
+        action=ActionYesNo(no_prefix=None),  # type: ignore[arg-type]
+        default=False,
+        help="Run again on a coarser grid, and there with other substeps, and tell how far the motion can be trusted.",
     )
     for name, own in OPTIONS.items():
         parser.add_argument(f"--{name}", type=type(own.default), default=own.default, help=own.help, **own.more)
@@ -343,7 +349,7 @@ def _parts(value: Any) -> dict[str, Any]:
 
 
 COMMON = {
-    "The run": ("config", "preset", "output", "frames", "resume", "device"),
+    "The run": ("config", "preset", "output", "frames", "resume", "certify", "device"),
     "The object": ("scene.ply", "scene.up", "scene.longest_side", "scene.region"),
     "Its material, and where it is held": (
         "material", "material.E", "material.density", "material.thickness", "solver.dx", "solver.boundaries"

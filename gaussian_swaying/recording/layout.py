@@ -8,6 +8,7 @@ from pathlib import Path
 from gaussian_swaying.rendering.passes import PASSES
 
 _FILES = ["run.json", "config.yaml", "checkpoint.pt", "summary.json", "diagnostics.csv", "film.html", "cameras"]
+_FILES += ["certificate.svg"]
 _FILES += ["trajectory", "nodes", "trajectory.npz", "nodes.npz"]
 
 

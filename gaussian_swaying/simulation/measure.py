@@ -448,11 +448,12 @@ def extremes(log: Sequence[Mapping[str, Any]], where: Tensor, size: float, elast
     return found
 
 
-def advice(found: Mapping[str, Any], E: float, thickness_matters: bool = True) -> list[str]:
+def advice(found: Mapping[str, Any], E: float, thickness_matters: bool = True, pins: bool = True) -> list[str]:
     """Sentences on what went wrong with the shape of the object and what to change; none if all is well.
 
     Args:
         E: Largest Young's modulus of the run [Pa].
+        pins: Whether ``solver.boundaries`` has any.
     """
     low, high = SOUND
     small, large, moved = found["compressed"], found["stretched"], found["moved"]
@@ -474,10 +475,8 @@ def advice(found: Mapping[str, Any], E: float, thickness_matters: bool = True) -
     stiffer = f"raise `material.E` to about {E * factor:.0e} Pa"
     if thickness_matters:
         stiffer += f" or `material.thickness` to {factor:.0f} times"
-    said.append(
-        f"What to change: {stiffer}; or weaken `wind.flow`; or enlarge the `region` of the pins in "
-        "`solver.boundaries`, if parts move that should stay in place."
-    )
+    enlarge = "; or enlarge the `region` of the pins in `solver.boundaries`, if parts move that should stay in place"
+    said.append(f"What to change: {stiffer}; or weaken `wind.flow`{enlarge if pins else ''}.")
     return said
 
 

@@ -22,6 +22,7 @@ from gaussian_swaying.recording.recorder import Recorder, frame_folder
 from gaussian_swaying.rendering.passes import PASSES
 from gaussian_swaying.runs import signals
 from gaussian_swaying.simulation.body import SimulatedScene, coarse, narrow
+from gaussian_swaying.simulation.certificate import Certificate
 from gaussian_swaying.simulation.draw import Painter, View, frames_from
 from gaussian_swaying.simulation.measure import RunProgress, SimulationDiverged, advice, extremes
 from gaussian_swaying.simulation.step import SceneEditor, Stepper, check_recorder
@@ -73,7 +74,7 @@ def run_health(stepper: Stepper, log: Sequence[Mapping[str, Any]]) -> tuple[dict
     elastic = points.elastic
     size = scene.size * scene.frame.metres_per_unit
     found = extremes(log, where, size, None if elastic is None else elastic.cpu())
-    told = advice(found, float(points.youngs_modulus.amax()), scene.filled == 0)
+    told = advice(found, float(points.youngs_modulus.amax()), scene.filled == 0, len(stepper.solver.boundaries) > 0)
     told += coarse(size, stepper.solver.dx)
     if scene.filled == 0 and found["moved"] is not None:
         told += narrow(points.position.reshape(-1, 3).cpu(), stepper.solver.dx, found["moved"]["share"])
@@ -193,15 +194,23 @@ class Run:
         recorder: The outputs.
         frames: Number of frames; the first is the state at rest.
         config: The resume key.
+        certificate: Tells how far the motion can be trusted; None if that is not asked.
 
     Attributes:
         log: Diagnostics of the frames.
     """
 
     def __init__(
-        self, painter: Painter, editor: SceneEditor, recorder: Recorder, frames: int, config: str = ""
+        self,
+        painter: Painter,
+        editor: SceneEditor,
+        recorder: Recorder,
+        frames: int,
+        config: str = "",
+        certificate: Certificate | None = None,
     ) -> None:
         self.painter, self.editor, self.recorder, self.frames, self.config = painter, editor, recorder, frames, config
+        self.certificate = certificate
         self.stepper, self.scene = editor.stepper, painter.scene
         if self.stepper.copies is not None:
             check_recorder(recorder)
@@ -264,6 +273,8 @@ class Run:
                 state = frame.state
                 with torch.cuda.stream(drawn) if drawn is not None else nullcontext():
                     self.record(state, index)
+                    if self.certificate is not None:
+                        self.certificate.see(state)
                     self.log.append(frame.health.as_dict())
                     with walls("writing"):
                         self.keep(state, index)
@@ -289,6 +300,9 @@ class Run:
             stepper.progress = None
             summary = self.close(status, reason, state, done, settings)
         summary["wall_s"] = walls.read(wait=True)
+        if self.certificate is not None:
+            summary["certificate"] = self.certificate.whole(self.log, sum(summary["wall_s"].values()), progress)
+            self.files += self.certificate.plot(recorder.folder, summary["certificate"])
         recorder.write_summary(summary)
         return summary
 

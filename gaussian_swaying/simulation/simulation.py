@@ -56,6 +56,7 @@ from gaussian_swaying.rendering.gsplat_renderer import load_kernels, loaded_befo
 from gaussian_swaying.rendering.protocol import Renderer
 from gaussian_swaying.rendering.shading import Shader
 from gaussian_swaying.simulation.body import Material, SimulatedScene, with_parts
+from gaussian_swaying.simulation.certificate import Certificate
 from gaussian_swaying.simulation.draw import CopiesPainter, Frame, Painter, frames_from
 from gaussian_swaying.simulation.measure import FrameDiagnostics, SimulationDiverged
 from gaussian_swaying.simulation.model import (
@@ -218,6 +219,7 @@ class Simulation(Fixed):
         settings, material = as_scene(scene, up), as_material(material)
         cloud = settings.cloud() if cloud is None else cloud  # read once
         solver = as_solver(solver, hold, settings, cloud, damping)
+        self._made_with = given | {"solver": solver, "hold": None}
         if normalisation is not None:
             if hold is not None:
                 raise ValueError("`hold` cannot be combined with `normalisation`: give a solver with the pins.")
@@ -467,16 +469,34 @@ class Simulation(Fixed):
     @property
     def config(self) -> str:
         """The complete configuration as YAML, with arguments from Python and later changes; runs resume by it."""
-        given, heading = dict(self._given), "changed_in_python" if self._text else "made_in_python"
-        for name, (part, marks) in self._running().items():
-            first = self._first[name][1]
-            if len(first) != len(marks) or not all(map(_same, first, marks)):
-                given[name] = part
-        return self._text + python_text(heading, given)
+        heading = "changed_in_python" if self._text else "made_in_python"
+        return self._text + python_text(heading, self._given | self._changes())
 
     @config.setter
     def config(self, text: str) -> None:
         self._text, self._given, self._first = text, {}, self._running()
+
+    def _changes(self) -> dict[str, object]:
+        """The parts that were changed since the simulation was made."""
+        found: dict[str, object] = {}
+        for name, (part, marks) in self._running().items():
+            first = self._first[name][1]
+            if len(first) != len(marks) or not all(map(_same, first, marks)):
+                found[name] = part
+        return found
+
+    def on_grid(self, ratio: float) -> Simulation:
+        """The simulation made again, on cells ``ratio`` times as large.
+
+        Raises:
+            ValueError: If it was changed since it was made, or cannot be simulated on that grid.
+        """
+        if self._changes():
+            changes = ", ".join(f"`{name}`" for name in self._changes())
+            raise ValueError(f"{changes} changed after the simulation was made: make it with the new values instead.")
+        solver = self._made_with["solver"]
+        coarser = solver.like(replace(solver.settings, dx=ratio * solver.dx))
+        return type(self)(**self._made_with | {"solver": coarser, "device": self.device})
 
     # ---- from a YAML file
 
@@ -586,6 +606,7 @@ class Simulation(Fixed):
         settings: Mapping[str, Any] | None = None,
         progress: bool = True,
         recorder: Recorder | None = None,
+        certify: bool = False,
     ) -> dict[str, Any]:
         """Simulate, render and record, as ``gaussian-swaying sim`` does.
 
@@ -596,6 +617,8 @@ class Simulation(Fixed):
             settings: Additional entries for the summary.
             progress: Show a progress bar.
             recorder: Outputs from now on; the recorder of the constructor if None.
+            certify: Also run on a coarser grid, and there with other substeps, which takes as long again, and add the
+                error of the places, see :mod:`~gaussian_swaying.simulation.certificate`.
 
         Returns:
             The summary, as in ``summary.json``.
@@ -606,7 +629,11 @@ class Simulation(Fixed):
         """
         self._recorder = self._recorder if recorder is None else self._recorder_or(recorder)
         count = self.frames_wanted if frames is None else check_frames("frames", frames)
-        run, self._resumable = Run(self._painter, self._editor, self._recorder, count, self.config), None
+        if certify and resume:
+            raise ValueError("`certify` needs all frames of a run: leave out `resume`.")
+        certificate = Certificate(self, count) if certify else None
+        run = Run(self._painter, self._editor, self._recorder, count, self.config, certificate)
+        self._resumable = None
         try:
             return run.whole(Path(output), resume, dict(settings or {}), progress)
         finally:

@@ -148,6 +148,8 @@ def suggest(
     own, support = gaussians[simulated], None
     _check_extent(own.means)
     height = extent(own.means @ axis, 0.002)
+    if hold is None and kind == "hanging":
+        hold = "top"
     if hold is None:
         support = potted_plant(own, axis) or flag_on_pole(own, axis) or washing_line(own, axis)
     parts = labelled(gaussians, simulated, height, support and support[0])

@@ -15,11 +15,12 @@ from shared import refused
 from small_scenes import plain_cloud, together
 from things import potted_plant
 
-from gaussian_swaying.cli.preview import main
+from gaussian_swaying.cli.preview import doubts, main
 from gaussian_swaying.cli.simulate import main as simulate
 from gaussian_swaying.gaussians.parts import Parts
 from gaussian_swaying.gaussians.ply import read_ply, write_ply
 from gaussian_swaying.scenes.procedural import FlagScene
+from gaussian_swaying.suggestion.suggest import suggest
 
 ROOT = Path(__file__).parents[2]
 FLAG = ROOT / "configs/sim/flag.yaml"
@@ -91,7 +92,7 @@ def test_ten_lines_and_a_command_for_a_shell(splat, tmp_path, capsys):
     lines = [line for line in told.splitlines() if "warning" not in line]
     assert len(lines) == 10 < len(whole.splitlines()) / 2
     assert told.splitlines()[1].split(";")[0] in whole
-    assert shlex.split(lines[-2])[2:4] == ["--config", str(folder / "out/starter.yaml")]
+    assert shlex.split(lines[-2])[2:] == ["--config", str(folder / "out/starter.yaml"), "--output", "outputs/out"]
     assert lines[-1].endswith("starter.yaml; --verbose says more")
     assert "PinnedRegion" not in said
 
@@ -182,6 +183,16 @@ def test_a_weak_guess_comes_with_the_option_of_the_next_best(tmp_path, capsys):
     assert re.search(r"warning: that these \d+ Gaussians are the object is a weak guess", told)
     assert re.search(r"give another box than --region( -?[\d.]+){6}\n", told)
     assert re.search(r"the next best is --up [+-][xyz]\n", told)
+
+
+def test_what_is_rigid_comes_with_a_way_to_make_it_swing(splat):
+    found = suggest(splat, tune=False)
+    notes = {
+        kind: [line for line in doubts(dataclasses.replace(found, kind=kind)) if "--kind" in line]
+        for kind in ("flag", "rigid")
+    }
+    assert notes["flag"] == []
+    assert notes["rigid"] == ["note: little of it sways; if it hangs, add --kind hanging"]
 
 
 def test_options_replace_guesses(splat, tmp_path, capsys):

@@ -116,7 +116,7 @@ def test_help_shows_the_options_that_people_use(capsys):
     (text, common), (whole, every) = _help(capsys, "--help"), _help(capsys, "--help-all")
     assert _help(capsys, "-h") == (text, common)
     assert common[:2] == ["--help", "--help-all"]
-    assert len(common) == len(set(common)) == 2 + 20
+    assert len(common) == len(set(common)) == 2 + 21
     needed = {
         "--config",
         "--output",

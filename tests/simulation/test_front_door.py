@@ -177,7 +177,7 @@ def test_the_constructor_is_the_schema():
     parser = Simulation.parser()
     options = {name.split(".")[0] for name in parser.get_defaults().keys(branches=True)}
     names = set(arguments_of(Simulation))
-    assert options - names == {"config", "output", "frames", "resume", "slow", "loop", *CUSTOM}
+    assert options - names == {"config", "output", "frames", "resume", "certify", "slow", "loop", *CUSTOM}
     assert names - options == set()
     assert set(inspect.signature(Simulation).parameters) - names == set(PYTHON_ONLY)
 

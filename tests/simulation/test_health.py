@@ -48,6 +48,8 @@ def test_sentences_name_place_amount_and_remedy(log, words):
     assert len(said) == 3
     for word in (*words, "`material.E` to about", "`material.thickness`", "`wind.flow`", "`solver.boundaries`"):
         assert word in " ".join(said), (word, said)
+    assert "pins" in said[-1]
+    assert "pins" not in " ".join(advice(extremes(log, WHERE, 2.0, None), 5e4, pins=False))
     assert "thickness" not in " ".join(advice(extremes(log, WHERE, 2.0, None), 5e4, thickness_matters=False))
 
 

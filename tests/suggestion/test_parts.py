@@ -311,6 +311,7 @@ def test_a_kind_or_a_material_may_be_given():
     found = kind(cloud, hold="bottom", kind="shrub")
     assert (found.kind, found.kind_reason, found.longest_side) == ("shrub", "given", pytest.approx(1.2))
     assert kind(cloud, hold="bottom", kind="shrub", longest_side=3.0).longest_side == pytest.approx(3.0)
+    assert kind(cloud, kind="hanging").hold.name == "top"
     silk = kind(FlagScene(spacing=0.05).generate(), material="silk", hold="-x")
     assert (silk.youngs_modulus, silk.thickness) == (MATERIALS["silk"].E, MATERIALS["silk"].thickness)
     assert (silk.sways, silk.real) == (False, True)
