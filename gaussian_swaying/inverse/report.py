@@ -22,8 +22,9 @@ from gaussian_swaying.inverse.pictures import BEFORE, titled
 from gaussian_swaying.inverse.unknowns import SCALE, Unknown, of_simulation, values_at
 from gaussian_swaying.inverse.videos import Footage
 from gaussian_swaying.recording.video import VideoEncoder
-from gaussian_swaying.simulation.model import POLAR, flow_of, in_settings
+from gaussian_swaying.simulation.model import POLAR, in_settings
 from gaussian_swaying.simulation.simulation import Simulation
+from gaussian_swaying.wind.field import flow_of
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import torch
 
 from gaussian_swaying.inverse.unknowns import Unknown, Values, turn, values_at
-from gaussian_swaying.simulation.model import Model, flow_of
+from gaussian_swaying.simulation.model import Model
+from gaussian_swaying.wind.field import flow_of
 
 FLAT = 0.8
 """Part of the area that faces one way, level with the ground, from which the wind may be mirrored: a mean square."""

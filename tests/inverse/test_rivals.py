@@ -9,7 +9,7 @@ import torch
 from gaussian_swaying.inverse.plan import read_unknown
 from gaussian_swaying.inverse.rivals import mirrored, mirrored_place
 from gaussian_swaying.inverse.unknowns import apart_by
-from gaussian_swaying.simulation.model import flow_of
+from gaussian_swaying.wind.field import flow_of
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")
 
