@@ -46,6 +46,7 @@ SENSE = {
     "speed": Sense("m/s", 0.0, 1e4),
     "azimuth": Sense("degrees", -1e6, 1e6),
     "elevation": Sense("degrees", -1e6, 1e6),
+    "gusts": Sense("", 0.0, 1e3),
     "amplitude": Sense("", 0.0, 1e3),
     "delta": Sense("", 0.0, 1e3),
     "std": Sense("m/s", 0.0, 1e4),

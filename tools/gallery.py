@@ -147,6 +147,14 @@ def newton_cloth(names: Names, axes: Any) -> None:
     axes.legend(frameon=False, markerscale=5)
 
 
+def newton_mpm(names: Names, axes: Any) -> None:
+    """The post from its side, six times beside each other."""
+    for k, frame in enumerate(names["moved"][::10]):
+        axes.scatter(frame[:, 1] + 0.3 * k, frame[:, 2], s=1, c=names["means"][:, 0], cmap="viridis")
+        axes.text(0.3 * k, 0.52, f"{0.2 * k:.1f} s", ha="center")
+    axes.set(aspect="equal", xlabel="y [m], shifted", ylabel="z [m]", ylim=(-0.02, 0.58))
+
+
 def sand(names: Names, axes: Any) -> None:
     """The heap from its side, before and after."""
     for x, color, label in zip(
@@ -261,6 +269,7 @@ OWN: dict[str, Callable[[Names], Image.Image]] = {
     "live_page": page("live_page.html", "!!window.windPage"),
     "magnet": plotted(magnet),
     "newton_cloth": plotted(newton_cloth),
+    "newton_mpm": plotted(newton_mpm),
     "own_splat": saved("own_splat.png"),
     "render_passes": passes,
     "sand": plotted(sand),

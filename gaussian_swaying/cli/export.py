@@ -22,7 +22,7 @@ from gaussian_swaying.simulation.export import export_run
 
 TAKEN = {
     "a film": "",
-    "the frames of a run": "apart spz_version fps box bones",
+    "the frames of a run": "apart spz_version fps box bones proxy",
     "a splat": "up metres_per_unit spz_version",
 }
 """The options of each kind of export; a format may have fewer."""
@@ -53,6 +53,7 @@ def build_options() -> argparse.ArgumentParser:
     box = ("X0", "Y0", "Z0", "X1", "Y1", "Z1")
     add("--box", nargs=6, type=float, metavar=box, help="write only the Gaussians that are in this box at rest")
     add("--bones", type=int, help="write a run as one .glb, a skin with so many bones (48 is good for most)")
+    add("--proxy", action="store_true", default=None, help="with --bones, write a mesh that moves instead of Gaussians")
     add("--up", nargs=3, type=float, metavar=("X", "Y", "Z"), help="up in the scene, for USD and glTF; default: z")
     add("--metres-per-unit", type=float, help="length of a scene unit [m], for USD and glTF; default: 1")
     add("--spz-version", type=int, choices=WRITTEN, help="of an .spz file; default: 3, which most programs read")
@@ -83,8 +84,8 @@ def export(options: argparse.Namespace) -> None:
     what = "a film" if plays else "the frames of a run" if Path(options.source).is_dir() else "a splat"
     format = None if plays else FORMATS[format_of(options.target)]
     known = () if format is None else (*format.options, "apart", "fps", "box", *(["up"] if format.in_metres else []))
-    known = (*known, "bones") if format is FORMATS["glb"] else known
-    for name in ("up", "metres_per_unit", "spz_version", "apart", "fps", "box", "bones"):
+    known = (*known, "bones", "proxy") if format is FORMATS["glb"] else known
+    for name in ("up", "metres_per_unit", "spz_version", "apart", "fps", "box", "bones", "proxy"):
         if vars(options)[name] is not None and name not in {*TAKEN[what].split()}.intersection(known):
             where = f" as {Path(options.target).suffix}" if format else ""
             raise ValueError(f"--{name.replace('_', '-')} is not for {what}{where}: leave it out.")
@@ -111,5 +112,5 @@ def export(options: argparse.Namespace) -> None:
         print(f"wrote {options.target}")
     else:
         own = {name: vars(options)[name] for name in ("fps", "box", "bones")}
-        own |= {"apart": bool(options.apart), "spz_version": options.spz_version or 3}
+        own |= {"apart": bool(options.apart), "proxy": bool(options.proxy), "spz_version": options.spz_version or 3}
         print("\n".join(export_run(Path(options.source), Path(options.target), **own)))

@@ -8,7 +8,7 @@ import json
 import os
 import struct
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -34,6 +34,8 @@ _CHUNK = struct.Struct("<I4s")
 _UNDERSTOOD = (_EXTENSION, "KHR_mesh_quantization")
 _TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _UPRIGHT = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)  # z up to y up
+_RECTANGLES = 4000  # of a mesh in the place of Gaussians, at most
+_UNLIT = {"doubleSided": True, "extensions": {"KHR_materials_unlit": {}}}
 _STEPS = 1 << 22  # opacities in float32 end half of such a step before 0 and 1
 
 
@@ -91,15 +93,17 @@ def encode_gltf(cloud: GaussianCloud, rotation: Tensor | None = None, metres_per
         f"{_EXTENSION}:OPACITY": file.add(cloud.opacities.sigmoid()),
     } | {name: file.add(cloud.sh[:, index]) for index, name in enumerate(_harmonics(cloud.sh_degree))}
     node: dict[str, Any] = {"mesh": 0, "translation": cloud.origin} if any(cloud.origin) else {"mesh": 0}
-    return file.encode(columns, nodes=[node], scenes=[{"nodes": [0]}])
+    return file.encode([_splats(columns)], [_EXTENSION], nodes=[node], scenes=[{"nodes": [0]}])
 
 
 def encode_skinned_gltf(
-    cloud: GaussianCloud, bones: Bones, fps: float, rotation: Tensor | None = None, metres_per_unit: float = 1.0
-) -> bytes:
+    cloud: GaussianCloud, bones: Bones, fps: float, rotation: Tensor | None = None, metres_per_unit: float = 1.0,
+    proxy: bool = False,
+) -> bytes:  # fmt: skip
     """A .glb file whose Gaussians move with the joints of a skin, in the animation ``wind``; without harmonics above 0.
 
-    Positions and sizes have 16 bits, rotations 8. Programs that do not know skins show the Gaussians at rest.
+    Positions and sizes have 16 bits, rotations 8. What follows the first bone alone is a mesh without a skin. Programs
+    that do not know skins show the Gaussians at rest.
 
     Args:
         cloud: The Gaussians at rest.
@@ -107,6 +111,8 @@ def encode_skinned_gltf(
         fps: Frames per second.
         rotation: As for :func:`encode_gltf`.
         metres_per_unit: As for :func:`encode_gltf`.
+        proxy: Whether to write, instead of the Gaussians, coloured rectangles in the places of some of them, which move
+            in programs that know skins but no Gaussians.
 
     Returns:
         The content of the file.
@@ -115,8 +121,8 @@ def encode_skinned_gltf(
     matrix, origin = turn * metres_per_unit, torch.tensor(cloud.origin, dtype=torch.float64)
     cloud = _moved(cloud.to("cpu", torch.float32), matrix, torch.zeros(3, dtype=torch.float64))
     low, high = cloud.means.double().aminmax(dim=0)
-    half = max(0.5 * float((high - low).max()), float(cloud.scales.max().exp()))
-    middle = 0.5 * (low + high)
+    half = 1.0 if proxy else max(0.5 * float((high - low).max()), float(cloud.scales.max().exp()))
+    middle = torch.zeros(3, dtype=torch.float64) if proxy else 0.5 * (low + high)
     centres = (bones.centres + origin) @ matrix.T - torch.tensor(cloud.origin, dtype=torch.float64)
     places = centres + bones.shifts @ matrix.T
     turns = rotation_to_quat(turn @ quat_to_rotation(bones.quats) @ turn.T)[..., [1, 2, 3, 0]]
@@ -126,37 +132,73 @@ def encode_skinned_gltf(
     file = _Glb()
     weight = (bones.weight * 255).round()
     weight[torch.arange(len(weight)), weight.argmax(1)] += 255 - weight.sum(1)  # of sum one
-    columns = {
-        "POSITION": file.add(_steps((cloud.means.double() - middle) / half, 32767), normalized=True, bounds=True),
-        "COLOR_0": file.add(_shown_color(cloud), normalized=True),
-        f"{_EXTENSION}:ROTATION": file.add(
-            _steps(torch.nn.functional.normalize(cloud.quats, dim=-1)[:, [1, 2, 3, 0]], 127), normalized=True
-        ),
-        f"{_EXTENSION}:SCALE": file.add(_steps(cloud.scales.double().exp() / half, 32767), normalized=True),
-        f"{_EXTENSION}:OPACITY": file.add((cloud.opacities.sigmoid() * 255).round().to(torch.uint8), normalized=True),
-        _harmonics(0)[0]: file.add(cloud.sh[:, 0]),
-        "JOINTS_0": file.add(bones.index.to(torch.uint8)),
-        "WEIGHTS_0": file.add(weight.to(torch.uint8), normalized=True),
-    }
+
+    def joints(part: Tensor) -> dict[str, int]:
+        own = weight[part].to(torch.uint8)
+        return {"JOINTS_0": file.add(bones.index[part].to(torch.uint8)), "WEIGHTS_0": file.add(own, normalized=True)}
+
+    if proxy:
+        part, corners = _rectangles(cloud)
+        shown = _shown_color(cloud.select(part))
+        columns = {"POSITION": file.add(corners, bounds=True), "COLOR_0": file.add(shown, normalized=True)}
+        meshes = [{"attributes": columns | joints(part), "material": 0}]
+    else:
+        still = (weight * (bones.index == 0)).sum(1) == 255
+        meshes = [_splats(_packed(file, cloud.select(~still), middle, half) | joints(~still))]
+        meshes += [_splats(_packed(file, cloud.select(still), middle, half))] if bool(still.any()) else []
     count, frames = len(centres), len(bones.quats)
     inverse = file.add(bind.mT.reshape(count, 16).float(), vertex=False)
     times = file.add(torch.arange(frames) / fps, vertex=False, bounds=True)
     samplers, channels = list[dict[str, Any]](), list[dict[str, Any]]()
-    for joint in range(count):
+    for joint in range(1, count):  # the first one stays
         for path, values in (("translation", places[:, joint].float()), ("rotation", turns[:, joint].float())):
             samplers.append({"input": times, "output": file.add(values, vertex=False)})
             channels.append({"sampler": len(samplers) - 1, "target": {"node": joint + 2, "path": path}})
-    joints = [{"translation": place} for place in places[0].tolist()]
+    nodes: list[dict[str, Any]] = [{"translation": place} for place in places[0].tolist()]
     root = {"children": [*range(2, count + 2)], **({"translation": cloud.origin} if any(cloud.origin) else {})}
-    at_rest = (middle + torch.tensor(cloud.origin, dtype=torch.float64)).tolist()
+    place = {"scale": [half] * 3, "translation": (middle + torch.tensor(cloud.origin, dtype=torch.float64)).tolist()}
+    nodes = [{"mesh": 0, "skin": 0, **place}, root, *nodes, *({"mesh": k, **place} for k in range(1, len(meshes)))]
+    parts: dict[str, Any] = {"materials": [_UNLIT]} if proxy else {}
     return file.encode(
-        columns,
-        used=["KHR_mesh_quantization"],
-        nodes=[{"mesh": 0, "skin": 0, "scale": [half] * 3, "translation": at_rest}, root, *joints],
-        scenes=[{"nodes": [0, 1]}],
+        meshes,
+        ["KHR_materials_unlit"] if proxy else [_EXTENSION, "KHR_mesh_quantization"],
+        nodes=nodes,
+        scenes=[{"nodes": [0, 1, *range(count + 2, len(nodes))]}],
         skins=[{"joints": [*range(2, count + 2)], "skeleton": 1, "inverseBindMatrices": inverse}],
         animations=[{"name": "wind", "samplers": samplers, "channels": channels}],
+        **parts,
     )
+
+
+def _packed(file: _Glb, cloud: GaussianCloud, middle: Tensor, half: float) -> dict[str, int]:
+    """The Gaussians in few bits, within a box of half the size ``half`` around ``middle``."""
+    quats = torch.nn.functional.normalize(cloud.quats, dim=-1)[:, [1, 2, 3, 0]]
+    return {
+        "POSITION": file.add(_steps((cloud.means.double() - middle) / half, 32767), normalized=True, bounds=True),
+        f"{_EXTENSION}:ROTATION": file.add(_steps(quats, 127), normalized=True),
+        f"{_EXTENSION}:SCALE": file.add(_steps(cloud.scales.double().exp() / half, 32767), normalized=True),
+        f"{_EXTENSION}:OPACITY": file.add((cloud.opacities.sigmoid() * 255).round().to(torch.uint8), normalized=True),
+        _harmonics(0)[0]: file.add(cloud.sh[:, 0]),
+    }
+
+
+def _rectangles(cloud: GaussianCloud) -> tuple[Tensor, Tensor]:
+    """Two triangles for the most visible Gaussian of each cell: whose they are (M,), and their corners (M, 3)."""
+    sizes, axis = cloud.scales.exp().topk(2)
+    order = (cloud.opacities.sigmoid() * sizes.prod(1)).argsort(descending=True)
+    means, cell = cloud.means[order].double().numpy(), float(sizes.median())
+    while True:
+        first = np.unique(np.floor(means / cell), axis=0, return_index=True)[1]
+        if len(first) <= _RECTANGLES:
+            break
+        cell *= 1.2
+    kept = order[torch.from_numpy(first)]
+    own, longer = quat_to_rotation(cloud.quats[kept]), sizes[kept, 0].clamp_min(1e-30)
+    sides = own.gather(2, axis[kept, None].expand(-1, 3, -1)) * sizes[kept, None]
+    sides = sides * (0.6 * cell / longer).clamp_min(1.5)[:, None, None]  # so that neighbours meet
+    signs = sides.new_tensor([[-1, -1], [1, -1], [1, 1], [-1, -1], [1, 1], [-1, 1]])
+    corners = cloud.means[kept, None] + (sides[:, None] @ signs[..., None])[..., 0]
+    return kept.repeat_interleave(6), corners.flatten(0, 1)
 
 
 def _steps(values: Tensor, top: int) -> Tensor:
@@ -169,6 +211,13 @@ def _shown_color(cloud: GaussianCloud) -> Tensor:
     shown = (cloud.sh[:, 0] * SH_DC + 0.5).clamp(0, 1)
     linear = torch.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
     return (torch.cat([linear, cloud.opacities.sigmoid()[:, None]], dim=1) * 255).round().to(torch.uint8)
+
+
+def _splats(columns: dict[str, int]) -> dict[str, Any]:
+    """The primitive of Gaussians with these accessors."""
+    extension = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    extension |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
+    return {"attributes": columns, "mode": 0, "extensions": {_EXTENSION: extension}}
 
 
 class _Glb:
@@ -203,18 +252,16 @@ class _Glb:
         self.size += padded.nbytes
         return len(self.accessors) - 1
 
-    def encode(self, columns: dict[str, int], used: Sequence[str] = (), **parts: Any) -> bytes:
-        """The file of one primitive with these accessors, and further parts of the document."""
-        extension = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-        extension |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
-        primitive = {"attributes": columns, "mode": 0, "extensions": {_EXTENSION: extension}}
+    def encode(self, primitives: list[dict[str, Any]], used: list[str], **parts: Any) -> bytes:
+        """The file of meshes of one primitive each, with extensions, and further parts of the document."""
+        required = [name for name in used if name == "KHR_mesh_quantization"]
         document = {
             "asset": {"version": "2.0", "generator": "gaussian_swaying"},
-            "extensionsUsed": [_EXTENSION, *used],
-            **({"extensionsRequired": [*used]} if used else {}),
+            "extensionsUsed": used,
+            **({"extensionsRequired": required} if required else {}),
             "scene": 0,
             **parts,
-            "meshes": [{"primitives": [primitive]}],
+            "meshes": [{"primitives": [primitive]} for primitive in primitives],
             "accessors": self.accessors,
             "bufferViews": self.views,
             "buffers": [{"byteLength": self.size}],

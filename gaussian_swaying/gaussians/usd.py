@@ -17,11 +17,13 @@ from gaussian_swaying._files import atomic
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.gaussians.repair import faults
+from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.geometry.origin import NO_ORIGIN, Origin
 from gaussian_swaying.geometry.patches import smallest_axis_normal
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 
 _PRIM = "/World/Gaussians"
+_SEEN = 1e-3  # changes below leave no sample
 
 
 def write_usd(
@@ -35,8 +37,9 @@ def write_usd(
     """Write static or moving Gaussians as USD (.usd, .usdc or .usda).
 
     The prim is a ``ParticleField3DGaussianSplat`` with positions, orientations, scales, opacities and harmonics, with
-    values after exponential and sigmoid, and normals. Each number that changes has a sample for every frame. For
-    programs that cannot draw splats there are ``displayColor`` and ``displayOpacity``.
+    values after exponential and sigmoid, and normals. What changes has a sample for every frame; rotations, scales and
+    normals only when a shape or a normal has changed by a thousandth. For programs that cannot draw splats there are
+    ``displayColor`` and ``displayOpacity``.
 
     Args:
         clouds: One for each frame, all of the same size; read one by one.
@@ -45,7 +48,7 @@ def write_usd(
     """
     check_positive("fps", fps)
     check_positive("metres_per_unit", metres_per_unit)
-    last, origin, frame = dict[str, tuple[int, np.ndarray]](), NO_ORIGIN, start - 1
+    last, origin, frame = dict[str, tuple[int, dict[str, np.ndarray]]](), NO_ORIGIN, start - 1
     stage: Any = None
     for frame, cloud in enumerate(clouds, start):
         if stage is None:
@@ -53,19 +56,20 @@ def write_usd(
             stage, prim, attributes = _stage(cloud.sh_degree, fps, metres_per_unit, rotation, origin)
             stage.SetStartTimeCode(frame)
         arrays = usd_arrays(cloud.rebased(origin))
-        if last and len(arrays["positions"]) != len(last["positions"][1]):
+        if last and len(arrays["positions"]) != len(last["positions"][1]["positions"]):
             raise ValueError(f"Frame {frame} has another number of Gaussians than frame {start}.")
         for name, array in arrays.items():
             written, before = last.get(name, (frame, None))
-            if before is not None and np.array_equal(array, before):
+            if before is not None and _alike(name, arrays, before):
                 continue
-            samples = (
-                [(before, frame - 1)] if before is not None and written < frame - 1 else []
-            )  # constant up to there
-            for value, time in [*samples, (array, frame)]:
+            if before is not None and np.array_equal(array, before[name]):  # but others of the shape are not
+                last[name] = (written, arrays)
+                continue
+            constant = [(before[name], frame - 1)] if before is not None and written < frame - 1 else []
+            for value, time in [*constant, (array, frame)]:
                 for attribute in attributes[name]:
                     attribute.Set(_values(name, value), time)
-            last[name] = (frame, array)
+            last[name] = (frame, arrays)
         prim.GetExtentAttr().Set(_values("extent", np.stack(_extent(arrays))), frame)
     if stage is None:
         raise ValueError(f"{path} was not written because there are no frames; give at least one cloud.")
@@ -116,6 +120,20 @@ def _values(name: str, array: np.ndarray) -> Any:
     if name == "opacities":
         return Vt.FloatArray.FromNumpy(array)
     return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(array.reshape(-1, 3), dtype=np.float32))
+
+
+def _alike(name: str, now: dict[str, np.ndarray], before: dict[str, np.ndarray]) -> bool:
+    """Whether numbers look the same: the shapes of rotations and scales, of which one has several, and normals."""
+    if name == "normals":
+        return bool(np.abs(now[name] - before[name]).max(initial=0.0) < _SEEN)
+    if name not in ("orientations", "scales"):
+        return np.array_equal(now[name], before[name])
+    own, other = (
+        covariance(torch.from_numpy(one["orientations"]).double(), torch.from_numpy(one["scales"]).double().log())
+        for one in (now, before)
+    )
+    size = torch.from_numpy(before["scales"]).double().amax(1) ** 2
+    return bool(((own - other).abs().amax((1, 2)) <= _SEEN * size).all())
 
 
 def usd_arrays(cloud: GaussianCloud) -> dict[str, np.ndarray]:

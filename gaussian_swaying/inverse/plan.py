@@ -20,9 +20,9 @@ from gaussian_swaying._live import Live
 from gaussian_swaying._yaml_limits import read_fields
 from gaussian_swaying.config.gone import refuse_gone
 from gaussian_swaying.config.parser import check_settings, import_forces, option
-from gaussian_swaying.simulation.model import Model, find, flow_of, names
+from gaussian_swaying.simulation.model import Model, find, names
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.wind.field import WindField
+from gaussian_swaying.wind.field import WindField, flow_of
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace

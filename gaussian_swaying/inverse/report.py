@@ -24,8 +24,9 @@ from gaussian_swaying.inverse.tracks import Tracks, opencv, picture_of
 from gaussian_swaying.inverse.videos import Footage
 from gaussian_swaying.recording.video import VideoEncoder
 from gaussian_swaying.rendering.protocol import RenderOutput
-from gaussian_swaying.simulation.model import POLAR, flow_of, in_settings
+from gaussian_swaying.simulation.model import POLAR, in_settings
 from gaussian_swaying.simulation.simulation import Simulation, classify
+from gaussian_swaying.wind.field import flow_of
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace

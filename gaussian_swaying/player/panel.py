@@ -11,7 +11,8 @@ from gaussian_swaying.mpm.materials import MATERIALS, name_of
 from gaussian_swaying.player.session import Session
 from gaussian_swaying.rendering.passes import PASSES, colormap
 from gaussian_swaying.simulation.draw import speed_scale
-from gaussian_swaying.simulation.model import POLAR, angles_of, find, flow_of, number
+from gaussian_swaying.simulation.model import POLAR, find, number
+from gaussian_swaying.wind.field import WindField, angles_of, flow_of
 
 ENDS = {
     "wind.speed": (0.0, 30.0),
@@ -34,6 +35,12 @@ KINDS = {"sway": "SineSway", "gusts": "UniformGust", "noise": "GaussianGust"}
 OWN = "own numbers"  # of a material that is none of the known ones
 GRIDS = {"coarse": 1.5, "normal": 1.0, "fine": 0.7}
 RIM = 15.0  # m/s at the rim of the dial
+TRACKS = {
+    "speed": {"label": "Speed", "unit": "m/s", "low": 0.0, "high": 30.0, "digits": 1, "turns": False},
+    "azimuth": {"label": "Direction", "unit": "degrees", "low": -180.0, "high": 180.0, "digits": 0, "turns": True},
+    "gusts": {"label": "Gusts", "unit": "×", "low": 0.0, "high": 3.0, "digits": 2, "turns": False},
+}
+"""Of the timeline."""
 LIGHT = "shader.init_args.light"
 
 
@@ -82,6 +89,7 @@ class Panel:
             "light": lambda value: self._shade(True, float(value)),
             "shading": lambda value: self._shade(bool(value), self._light()),
             "free": lambda value: {"solver.boundaries": []},
+            "wind.schedule": self._keyed,
         }
 
     def groups(self) -> list[dict[str, Any]]:
@@ -93,6 +101,7 @@ class Panel:
             {"kind": "dial", "name": "wind.flow", "label": "Wind", "value": flow, "high": RIM}
         ]
         wind += [slider(name, value) for name, value in zip(POLAR, self._angles, strict=True)]
+        wind += self._timeline()
         gusts = []
         for place, modulation in enumerate(self._modulations()):
             kind = modulation["class_path"].rsplit(".", 1)[-1]
@@ -176,7 +185,43 @@ class Panel:
         }
 
     def _flow(self) -> list[float]:
-        return [round(float(x), 4) for x in self.session.simulation.stepper.flows()[0].tolist()]
+        wind, flow = self.session.simulation.wind, self.session.simulation.stepper.flows()[0]
+        if isinstance(wind, WindField):
+            flow = wind.mean_flow(torch.tensor(self.session.snapshot.health.time, dtype=torch.float64))
+        return [round(float(x), 4) for x in flow.tolist()]
+
+    def _tracks(self) -> list[str]:
+        """Names of the tracks of the timeline: keys of flows leave only gusts, and a file none."""
+        schedule = self.session.settings.wind.schedule
+        if isinstance(schedule, str):
+            return []
+        return ["gusts"] if any(key.flow is not None for key in schedule or ()) else list(TRACKS)
+
+    def _timeline(self) -> list[dict[str, Any]]:
+        wind, tracks = self.session.settings.wind, self._tracks()
+        speed, azimuth, _ = angles_of(wind.flow or [0.0, 0.0, 0.0])
+        keys = {
+            name: [[key.time, key[name]] for key in wind.schedule or () if key[name] is not None] for name in tracks
+        }
+        usual = {"speed": round(speed, 1), "azimuth": round(azimuth), "gusts": 1.0}
+        value = {"keys": keys, "usual": usual, "step": bool(wind.schedule) and wind.interpolation == "step"}
+        shown = [{"name": name, **TRACKS[name]} for name in tracks]
+        found = {"kind": "timeline", "name": "wind.schedule", "label": "Timeline", "tracks": shown, "value": value}
+        return [found] if tracks else []
+
+    def _keyed(self, value: Any) -> dict[str, Any]:
+        wind, rows = self.session.settings.wind, {}
+        for key in wind.schedule or ():
+            if key.flow is not None:
+                rows[key.time] = {"time": key.time, "flow": list(key.flow)}
+        keys = {name: value["keys"][name] for name in self._tracks()}
+        if keys.get("speed") and not keys["azimuth"] and not any(wind.flow or ()):
+            keys["azimuth"] = [[keys["speed"][0][0], self._angles[1]]]  # a calm has no direction of its own
+        for name, pairs in keys.items():
+            for time, value in pairs:
+                rows.setdefault(float(time), {"time": float(time)})[name] = float(value)
+        found = {"wind.schedule": [rows[time] for time in sorted(rows)] or None}
+        return found if wind.schedule else found | {"wind.interpolation": "linear"}
 
     def _modulations(self) -> list[dict[str, Any]]:
         return [

@@ -589,6 +589,7 @@ class Server:
                 elsewhere = self.door.token is not None
                 found["panel"] = {"groups": self.panel.groups(), "legends": self.panel.legends()}
                 found["panel"] |= {"together": list(TOGETHER), "elsewhere": elsewhere}
+                found["panel"] |= {"revision": session.revision}  # so that a refused value goes back
                 if self._first[0] is not session.simulation:  # which waits for the step that is under way
                     self._first = session.simulation, first_view(session.simulation)
                 found["panel"] |= self._first[1]

@@ -25,6 +25,7 @@ def export_run(
     fps: float | None = None,
     box: Sequence[float] | None = None,
     bones: int | None = None,
+    proxy: bool = False,
     apart: bool = False,
     spz_version: int = 3,
 ) -> list[str]:
@@ -35,7 +36,7 @@ def export_run(
         target: As in :func:`~gaussian_swaying.gaussians.formats.export_frames`; ``.glb`` for ``bones``.
         fps: Frames a second, by which those of the run can be divided; all if None.
         box: Lower and upper corner of the Gaussians to write, at rest [scene units].
-        bones: Write one skin with so many bones.
+        bones: Write one skin with so many bones; with ``proxy`` a mesh instead of Gaussians.
         apart: Write the Gaussians that never move once.
 
     Raises:
@@ -56,6 +57,8 @@ def export_run(
         raise ValueError("--box holds no Gaussian of the run: enlarge it, or leave it out.")
     if apart and (box is not None or bones is not None):
         raise ValueError("--apart cannot be combined with --box or --bones: leave it out.")
+    if proxy and bones is None:
+        raise ValueError("--proxy is a mesh that bones move: give their number, as in --bones 48.")
     motion = islice(run.frames(), 0, None, every)
     if bones is None:
         apart = apart and not format.film and not scene.all_move
@@ -83,7 +86,7 @@ def export_run(
     index[moving], weight[moving] = found.index, found.weight
     found = replace(found, index=index[inside], weight=weight[inside])
     with atomic(target) as temporary:
-        temporary.write_bytes(encode_skinned_gltf(cloud.select(inside), found, own / every, **place))
+        temporary.write_bytes(encode_skinned_gltf(cloud.select(inside), found, own / every, **place, proxy=proxy))
     told = [f"{bones} bones, {error:.2%} of the motion missed"]
     if cloud.sh_degree:
         told.append("note: colours that depend on the direction of view are the same from all sides.")

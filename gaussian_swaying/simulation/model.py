@@ -45,7 +45,7 @@ from gaussian_swaying.rendering.cameras.camera_path import CameraPath, OrbitCame
 from gaussian_swaying.scenes.procedural import GivenScene, ProceduralScene
 from gaussian_swaying.simulation.body import PLATE, Material, Scene, SimulatedScene, suggest_spacing
 from gaussian_swaying.wind.computed_air import ComputedAir
-from gaussian_swaying.wind.field import Modulation, SpatialWind, WindField, flow_rows
+from gaussian_swaying.wind.field import Modulation, SpatialWind, WindField, angles_of, flow_of, flow_rows
 from gaussian_swaying.wind.force import AeroForce
 from gaussian_swaying.wind.turbulence import LOOKS, look
 
@@ -270,9 +270,16 @@ def in_settings(settings: Namespace, values: Mapping[str, Any]) -> None:
         part, key = _place(settings, name)
         part[key] = value
         if name == "wind.flow":
-            settings.wind.schedule = None
+            settings.wind.schedule = _without_flow(settings.wind.schedule)
     if angles:
         settings.wind.flow = flow_of(list(settings.wind.flow), angles)
+
+
+def _without_flow(schedule: Any) -> list[Any] | None:
+    kept = [key.clone() for key in schedule or () if not isinstance(schedule, str) and key.gusts is not None]
+    for key in kept:
+        key.flow = key.speed = key.azimuth = None
+    return kept or None
 
 
 def of_settings(settings: Namespace, name: str) -> Any:
@@ -296,27 +303,6 @@ def _place(settings: Namespace, name: str) -> tuple[Any, str]:
     if entry.get("init_args") is None:
         entry["init_args"] = {}
     return entry["init_args"], parts[-1]
-
-
-def flow_of(base: Sequence[float], values: Mapping[str, float]) -> list[float]:
-    """A flow [m/s] with ``wind.speed``, ``wind.azimuth`` or ``wind.elevation`` replaced.
-
-    Example:
-        >>> [round(x, 3) for x in flow_of([2.0, 0.0, 0.0], {"wind.azimuth": 90.0})]
-        [0.0, 2.0, 0.0]
-    """
-    x, y, z = base
-    speed = values.get("wind.speed", math.hypot(x, y, z))
-    azimuth = math.radians(values["wind.azimuth"]) if "wind.azimuth" in values else math.atan2(y, x)
-    rise = math.radians(values["wind.elevation"]) if "wind.elevation" in values else math.atan2(z, math.hypot(x, y))
-    level = speed * math.cos(rise)
-    return [level * math.cos(azimuth), level * math.sin(azimuth), speed * math.sin(rise)]
-
-
-def angles_of(flow: Sequence[float]) -> tuple[float, float, float]:
-    """Speed [m/s], azimuth from x towards y and elevation [degrees] of a flow."""
-    x, y, z = flow
-    return math.hypot(x, y, z), math.degrees(math.atan2(y, x)), math.degrees(math.atan2(z, math.hypot(x, y)))
 
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # ITU-R BT.709

@@ -72,11 +72,13 @@ class Moment:
         time: The time [s], scalar float64 tensor; of a device function, shape (n,).
         flow: Flow without modulations and effects [m/s], shape (3,), float64; of a device function, (n, 3).
         carried: Displacement of the air by that flow since time zero [m]; likewise.
+        gusts: Factor of gusts, see ``WindField.strength``; as ``time``.
     """
 
     time: Tensor
     flow: Tensor
     carried: Tensor
+    gusts: Tensor
 
 
 class WindEffect(Component, nn.Module):
@@ -120,7 +122,7 @@ def blown(device_function: DeviceFunction, velocity: Tensor, position: Tensor, m
     def numbers(given: Any) -> tuple[Any, ...]:
         return tuple(given.to(position).reshape(-1).unbind()) if isinstance(given, Tensor) else tuple(given)
 
-    once = Moment(moment.time[None], moment.flow[None], moment.carried[None])
+    once = Moment(*(value[None] for value in vars(moment).values()))
     now = device_function.per_substep.take(once) if device_function.per_substep.count else ()
     table = Memory(device_function.table.take()) if device_function.table.count else None
     air, place = velocity.to(position).unbind(-1), position.unbind(-1)
@@ -203,7 +205,7 @@ class Plume(WindEffect):
 
     Example:
         >>> plume = Plume(radius=0.1, heat=10000.0)
-        >>> moment = Moment(torch.zeros(()), torch.zeros(3), torch.zeros(3))
+        >>> moment = Moment(torch.zeros(()), torch.zeros(3), torch.zeros(3), torch.ones(()))
         >>> plume(torch.zeros(3), torch.tensor([[0.0, 0.0, 1.0]]), moment)
         tensor([[0.0000, 0.0000, 1.8343]])
     """

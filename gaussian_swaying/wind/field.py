@@ -6,8 +6,9 @@ so they do not depend on the substep, on the device, or on where a run was resum
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal, TypeVar
@@ -111,16 +112,23 @@ def shaken(v, time, numbers, start):
     return add3(v, numbers[0], (x, y, counter_normal(start, counter, 2)))
 
 
+@triton.jit
+def strengthened(v, mean, gusts):
+    """A modulated velocity with `gusts` times as much of what was added to the mean; with 1 it stays, to the bit."""
+    return add3(v, gusts - 1, add3(v, -1.0, mean))
+
+
 @triton.jit(do_not_specialize=("count", "scenes"))
 def _modulate(
-    velocity, times, numbers, starts, count, scenes, KINDS: tl.constexpr, MODULATIONS: tl.constexpr,
+    velocity, times, gusts, numbers, starts, count, scenes, KINDS: tl.constexpr, MODULATIONS: tl.constexpr,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Change velocities (count, 3) of winds of several scenes, one after the other, in place."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = index < count
     time = tl.load(times + index, mask, 0.0)
-    v = load3(velocity, 1, 3 * index, mask)
+    mean = load3(velocity, 1, 3 * index, mask)
+    v = mean
     for m in tl.static_range(MODULATIONS):
         row = (index % scenes) * MODULATIONS + m
         own = load3(numbers, 1, 3 * row, mask)
@@ -131,6 +139,7 @@ def _modulate(
             v = scaled(v, time, (own[0], tl.where(mask, own[1], 1.0)), start)
         else:
             v = shaken(v, time, (own[0], tl.where(mask, own[1], 1.0)), start)
+    v = strengthened(v, mean, tl.load(gusts + index, mask, 0.0))
     store3(velocity, 1, 3 * index, v, mask)
 
 
@@ -224,15 +233,21 @@ KINDS = (SineSway, UniformGust, GaussianGust)
 @fixed
 @dataclass
 class FlowKey:
-    """One entry of a schedule.
+    """One entry of a schedule: the wind at a time, or some of its numbers, which may be tensors in Python.
 
     Args:
-        time: Time from which the flow applies [s].
-        flow: Air velocity [m/s], z up; in Python also a tensor, as in a :class:`WindField`.
+        time: Time of the key [s].
+        flow: Air velocity [m/s], z up; or give ``speed`` and ``azimuth``.
+        speed: Speed of the air [m/s].
+        azimuth: Direction in which it blows [degrees], from x towards y; it turns the shorter way to the next.
+        gusts: Factor of sway, gusts, ``Turbulence`` and ``FrozenWind``.
     """
 
     time: float
-    flow: list[float]
+    flow: list[float] | None = None
+    speed: float | None = None
+    azimuth: float | None = None
+    gusts: float | None = None
 
 
 class SpatialWind(Component, nn.Module, ABC):
@@ -280,19 +295,113 @@ def _row(name: str, flow: VectorLike) -> Tensor | tuple[float, ...]:
     return check_vector(name, flow)
 
 
+Curve = tuple[Tensor, Tensor]
+"""Times [s], shape (K,), and values, shape (K, ...); float64."""
+
+CURVES, BUFFERS = ("flow", "speed", "azimuth", "gusts"), ("times", "flows", "gust_times", "gusts")
+
+WITHIN = 1e-4
+"""Largest error of a turn that consists of straight pieces, as a share of the larger speed."""
+
+
+def _around(times: Tensor, time: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The keys before and after times (...), and the time since the former [s]."""
+    last = times.numel() - 1
+    key = (torch.searchsorted(times, time.contiguous(), right=True) - 1).clamp(0, last)
+    return key, (key + 1).clamp(max=last), time - picked(times, key)
+
+
+def keyed(curve: Curve, time: Tensor, interpolation: str) -> Tensor:
+    """Values of a curve at times [s] of shape (...), with the axes of a value after them; constant outside its keys."""
+    times, values = curve
+    if times.numel() == 1:
+        return values[0].expand(time.shape + values.shape[1:])
+    key, after, past = _around(times, time)
+    before = picked(values, key)
+    if interpolation == "step":
+        return before
+    share = (past / (picked(times, after) - picked(times, key)).clamp(min=1e-12)).clamp(0, 1)
+    return torch.lerp(before, picked(values, after), share.reshape(share.shape + (1,) * (values.ndim - 1)))
+
+
+def _curve(keys: Sequence[FlowKey], name: str) -> Curve | None:
+    """The keys that give a number, or the flow, with the gradients that are required."""
+    given = [(float(key.time), getattr(key, name)) for key in keys if getattr(key, name) is not None]
+    if not given:
+        return None
+    times, values = zip(*given, strict=True)
+    if name == "flow":
+        return _double(times), flow_rows("schedule.flow", values)
+    plain = check_vector(f"schedule.{name}", [number_of(value) for value in values], len(values))
+    kept = [value if requires_grad(value) else own for value, own in zip(values, plain, strict=True)]
+    return _double(times), torch.stack([torch.as_tensor(value, dtype=torch.float64).reshape(()) for value in kept])
+
+
+def _double(values: Sequence[float] | float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def _turning(speeds: Curve | None, azimuths: Curve | None, flow: VectorLike | None, interpolation: str) -> Curve:
+    """The flows of keys of speed and azimuth; what no key gives is that of a steady flow."""
+    base = check_vector("flow", (0.0, 0.0, 0.0) if flow is None else flow)
+    missing = "speed" if speeds is None else "azimuth"
+    if (speeds is None or azimuths is None) and not any(base):
+        raise ValueError(f"No key of `schedule` gives `{missing}`, and `flow` is zero: give one of the two.")
+    speed, azimuth, elevation = angles_of(base)
+    speeds, azimuths = speeds or (_double([0.0]), _double([speed])), azimuths or (_double([0.0]), _double([azimuth]))
+    times, angles = azimuths
+    turns = 180 - (180 - angles.diff()).remainder(360)
+    azimuths = times, torch.cat([angles[:1], angles[:1] + turns.cumsum(0)])
+    at = torch.cat([speeds[0], times]).unique()
+    if interpolation == "linear":
+        turn = keyed(azimuths, at, interpolation).detach().diff().abs().deg2rad()
+        pieces = (turn * (1 + turn / 2) / (4 * WITHIN)).sqrt().ceil().clamp(min=1).int().tolist()
+        spans = zip(pairwise(at.tolist()), pieces, strict=True)
+        at = _double([a + (b - a) * k / n for (a, b), n in spans for k in range(n)] + at[-1:].tolist())
+    rows = [keyed(curve, at, interpolation) for curve in (speeds, azimuths)]
+    return at, _from_angles(rows[0], rows[1].deg2rad(), _double(math.radians(elevation)))
+
+
+def _from_angles(speed: Tensor, azimuth: Tensor, elevation: Tensor) -> Tensor:
+    """Flows (..., 3) with angles in radians."""
+    level = speed * elevation.cos()
+    return torch.stack([level * azimuth.cos(), level * azimuth.sin(), speed * elevation.sin()], dim=-1)
+
+
+def flow_of(base: Sequence[float], values: Mapping[str, float]) -> list[float]:
+    """A flow [m/s] with ``wind.speed``, ``wind.azimuth`` or ``wind.elevation`` replaced.
+
+    Example:
+        >>> [round(x, 3) for x in flow_of([2.0, 0.0, 0.0], {"wind.azimuth": 90.0})]
+        [0.0, 2.0, 0.0]
+    """
+    x, y, z = base
+    speed = values.get("wind.speed", math.hypot(x, y, z))
+    azimuth = math.radians(values["wind.azimuth"]) if "wind.azimuth" in values else math.atan2(y, x)
+    rise = math.radians(values["wind.elevation"]) if "wind.elevation" in values else math.atan2(z, math.hypot(x, y))
+    flow: list[float] = _from_angles(*_double([speed, azimuth, rise])).tolist()
+    return flow
+
+
+def angles_of(flow: Sequence[float]) -> tuple[float, float, float]:
+    """Speed [m/s], azimuth from x towards y and elevation [degrees] of a flow."""
+    x, y, z = flow
+    return math.hypot(x, y, z), math.degrees(math.atan2(y, x)), math.degrees(math.atan2(z, math.hypot(x, y)))
+
+
 class WindField(Fixed, nn.Module):
     """Air velocity over time; the same everywhere in the scene, unless it has effects.
 
-    :meth:`together` makes one of the winds of several scenes: ``flows`` and the numbers of the modulations then have an
-    axis of B scenes, and so has every velocity.
+    :meth:`together` makes one of the winds of several scenes: ``flows``, ``gusts`` and the numbers of the modulations
+    then have an axis of B scenes, and so has every velocity.
 
     Args:
-        flow: Steady air velocity [m/s], z up; null with a ``schedule``. In Python also a tensor of shape (3,), which
-            keeps its gradient.
-        schedule: Flow that changes over time, used instead of ``flow``; the first entry also applies before its time.
+        flow: Steady air velocity [m/s], z up. In Python also a tensor of shape (3,), which keeps its gradient.
+        schedule: Keys of curves over time; the first of a curve also applies before its time. They give ``flow``, or
+            ``speed`` and ``azimuth``, and ``gusts``; what none gives is that of ``flow``, and gusts are as they are.
             Or the CSV of an anemometer (:func:`~gaussian_swaying.wind.wind_files.read_anemometer`), with linear
             interpolation.
-        interpolation: Between entries of the schedule: ``step`` (constant until the next) or ``linear``.
+        interpolation: Between keys: ``step`` (constant until the next) or ``linear``.
         modulations: Sway and gusts, applied in order.
         seed: Seed of the gusts.
         effects: Effects, which make the wind differ from place to place, applied in order after the modulations: a
@@ -304,6 +413,10 @@ class WindField(Fixed, nn.Module):
         tensor([2., 0., 0.], dtype=torch.float64)
     """
 
+    times: Tensor
+    flows: Tensor
+    gust_times: Tensor
+    gusts: Tensor
     live_as = "wind"
     live = live_numbers(
         flow=SAME | {"kind": "vector"}, seed=TOGETHER | {"kind": "whole"}, speed=SIZE | TOGETHER, azimuth=TOGETHER,
@@ -323,16 +436,22 @@ class WindField(Fixed, nn.Module):
         super().__init__()
         if isinstance(schedule, str):
             schedule, interpolation = list(map(FlowKey, *read_anemometer(schedule))), "linear"
-        keys = schedule or [FlowKey(0.0, flow)]  # type: ignore[arg-type]
-        times = [float(key.time) for key in keys]
-        if any(a >= b for a, b in pairwise(times)):
-            raise ValueError(f"Expected the times of `schedule` to increase, but got {times}.")
-        name = "schedule.flow" if schedule else "flow"
-        flows = flow_rows(name, [key.flow for key in keys])
-        self.register_buffer("times", torch.tensor(times, dtype=torch.float64))
-        self.register_buffer("flows", flows)
-        self.times: Tensor
-        self.flows: Tensor
+        keys = schedule or []
+        given = [float(key.time) for key in keys]
+        if any(a >= b for a, b in pairwise(given)):
+            raise ValueError(f"Expected the times of `schedule` to increase, but got {given}.")
+        for key in keys:
+            if all(getattr(key, name) is None for name in CURVES):
+                raise ValueError(f"The `schedule` has only a time at {key.time:g} s: add one of {', '.join(CURVES)}.")
+        found, speeds, azimuths, strength = (_curve(keys, name) for name in CURVES)
+        if speeds or azimuths:
+            if found:
+                raise ValueError("Expected keys of `schedule` with either `flow`, or `speed` and `azimuth`, not both.")
+            found = _turning(speeds, azimuths, flow, interpolation)
+        times, flows = found or (_double([0.0]), flow_rows("flow", [flow]))  # type: ignore[list-item]
+        gust_times, gusts = strength or (_double([0.0]), _double([1.0]))
+        for name, value in zip(BUFFERS, (times, flows, gust_times, gusts), strict=True):
+            self.register_buffer(name, value)
         self.interpolation = interpolation
         self.seed: int | Tensor = int(seed)
         self.modulations = FixedList(modulations)
@@ -361,14 +480,16 @@ class WindField(Fixed, nn.Module):
         kinds = {(wind.interpolation, *map(type, wind.modulations)) for wind in fields}
         if len(fields) < len(winds) or len(kinds) != 1:
             return None
-        times = torch.cat([wind.times for wind in fields]).unique()
+        times, gust_times = (torch.cat([getattr(wind, n) for wind in fields]).unique() for n in BUFFERS[::2])
         seeds = _seeds([int(wind.seed) for wind in fields], times)
         flows = torch.stack([wind.mean_flow(times) for wind in fields], dim=1)
+        gusts = torch.stack([wind.strength(gust_times) for wind in fields], dim=1)
         parts = []
         for same in zip(*[wind.modulations for wind in fields], strict=True):
             numbers = {name: times.new_tensor([getattr(part, name) for part in same]) for name in same[0].numbers}
             parts.append(_with_buffers(same[0], **numbers))
-        return changed(_with_buffers(fields[0], times=times, flows=flows, seed=seeds), modulations=FixedList(parts))
+        curves = dict(zip(BUFFERS, (times, flows, gust_times, gusts), strict=True))
+        return changed(_with_buffers(fields[0], **curves, seed=seeds), modulations=FixedList(parts))
 
     def with_seeds(self, seeds: Sequence[int]) -> WindField | list[WindField]:
         """Return the wind with a seed of its own for each scene of a batch, combined into one wind where possible."""
@@ -409,14 +530,8 @@ class WindField(Fixed, nn.Module):
         return changed(self, effects=effects, _in_metres=True)
 
     def with_flow(self, flow: VectorLike) -> WindField:
-        """The wind with another steady flow [m/s] instead of its flow or schedule; a tensor keeps its gradient."""
+        """The wind with another steady flow [m/s] in place of all keys of it; a tensor keeps its gradient."""
         return changed(self, flows=flow_rows("flow", [flow]), times=self.times.new_zeros(1))
-
-    def _keys(self, time: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The entries of the schedule before and after times (...), and the time since the former [s]."""
-        last = self.times.numel() - 1
-        key = (torch.searchsorted(self.times, time.contiguous(), right=True) - 1).clamp(0, last)
-        return key, (key + 1).clamp(max=last), self._wide(time - picked(self.times, key))
 
     def _wide(self, value: Tensor) -> Tensor:
         """Numbers (...) as factors of flows (..., 3) or (..., B, 3)."""
@@ -424,14 +539,15 @@ class WindField(Fixed, nn.Module):
 
     def mean_flow(self, time: Tensor) -> Tensor:
         """The flow without modulations [m/s] at times [s] of shape (...); shape (..., 3), float64."""
-        if self.times.numel() == 1:
-            return self.flows[0].expand(*time.shape, *self.flows.shape[1:])
-        key, after, past = self._keys(time)
-        before = picked(self.flows, key)
-        if self.interpolation == "step":
-            return before
-        span = (picked(self.times, after) - picked(self.times, key)).clamp(min=1e-12)
-        return torch.lerp(before, picked(self.flows, after), (past / self._wide(span)).clamp(0, 1))
+        return keyed((self.times, self.flows), time, self.interpolation)
+
+    def strength(self, time: Tensor) -> Tensor:
+        """The factor of the gusts at times [s] of shape (...); (...) or, of several scenes, (..., B), float64."""
+        return keyed((self.gust_times, self.gusts), time, self.interpolation)
+
+    def moment(self, time: Tensor) -> Moment:
+        """What the effects get at times [s]."""
+        return Moment(time, self.mean_flow(time), self.carried(time), self.strength(time))
 
     def carried(self, time: Tensor) -> Tensor:
         """Return the displacement of the air by the flow without modulations since time zero [m].
@@ -447,7 +563,8 @@ class WindField(Fixed, nn.Module):
         span = self._wide(self.times[1:] - self.times[:-1])
         mean = self.flows[:-1] if self.interpolation == "step" else 0.5 * (self.flows[:-1] + self.flows[1:])
         sums = torch.cat([torch.zeros_like(self.flows[:1]), (span * mean).cumsum(0)])
-        key, after, past = self._keys(torch.stack([torch.zeros_like(time), time]))
+        key, after, past = _around(self.times, torch.stack([torch.zeros_like(time), time]))
+        past = self._wide(past)
         found = sums[key] + past * self.flows[key]
         if self.interpolation == "linear":
             length = self._wide((self.times[after] - self.times[key]).clamp(min=1e-12))
@@ -464,7 +581,7 @@ class WindField(Fixed, nn.Module):
         Returns:
             Broadcastable to (..., P, 3).
         """
-        return self.shaped(self(time), position, Moment(time, self.mean_flow(time), self.carried(time)))
+        return self.shaped(self(time), position, self.moment(time))
 
     def shaped(self, velocity: Tensor, position: Tensor, moment: Moment) -> Tensor:
         """Apply the effects to a uniform velocity at some places.
@@ -501,13 +618,16 @@ class WindField(Fixed, nn.Module):
             Velocity [m/s], z up, shape (..., 3) or, of several scenes, (..., B, 3); float64.
         """
         time = torch.as_tensor(time, dtype=torch.float64, device=self.times.device)
-        velocity = self.mean_flow(time)
-        time = self._wide(time)[..., 0].expand(velocity.shape[:-1])
-        if self._known_rows(time) and replaces((velocity,), dtype=None):
-            return self.modulated(velocity, time)
+        velocity = mean = self.mean_flow(time)
+        if not len(self.modulations):
+            return velocity
+        gusts = self.strength(time).expand(mean.shape[:-1])
+        time = self._wide(time)[..., 0].expand(mean.shape[:-1])
+        if self._known_rows(time) and replaces((mean, gusts), dtype=None):
+            return self.modulated(mean, time, gusts)
         for stream, modulation in enumerate(self.modulations):
             velocity = modulation(velocity, time, self.seed, stream)
-        return velocity
+        return vectors(on_tensors(strengthened)(velocity.unbind(-1), mean.unbind(-1), gusts))
 
     def _known_rows(self, time: Tensor) -> bool:
         parts = all("function" in vars(type(part)) for part in self.modulations)
@@ -535,15 +655,19 @@ class WindField(Fixed, nn.Module):
         numbers, first = torch.stack(found[:-count], -1), torch.stack(found[-count:], -1)
         return numbers.reshape(-1, count, 3), first.reshape(-1, count)
 
-    def modulated(self, velocity: Tensor, time: Tensor) -> Tensor:
-        """Velocities (..., 3) at times (...) with all modulations, in one kernel; in torch they take some seventy."""
+    def modulated(self, velocity: Tensor, time: Tensor, gusts: Tensor) -> Tensor:
+        """Velocities (..., 3) at times (...) with all modulations, in one kernel; in torch they take some seventy.
+
+        Args:
+            gusts: :meth:`strength` at these times, shape (...).
+        """
         assert self._rows is not None
         *_, numbers, starts = self._rows
         found, block = velocity.contiguous().clone(), lanes(velocity.device, 64)
         kinds = tuple(KINDS.index(type(part)) for part in self.modulations)
         with torch.cuda.device_of(found):
             launch(_modulate, (triton.cdiv(time.numel(), block),))(
-                found, time.contiguous(), numbers, starts, time.numel(), len(starts), KINDS=kinds,
+                found, time.contiguous(), gusts.contiguous(), numbers, starts, time.numel(), len(starts), KINDS=kinds,
                 MODULATIONS=len(kinds), BLOCK=block, num_warps=2,
             )  # fmt: skip
         return found

@@ -792,7 +792,7 @@ class WindForce(Force):
         if not (self._shared and isinstance(wind, WindField)):
             return super().during(time, dt, steps)
         times = _times(time, dt, steps)
-        moments = list(map(Moment, times, wind.mean_flow(times), wind.carried(times)))
+        moments = list(map(Moment, *vars(wind.moment(times)).values()))
         blown = _blow(wind, times)
         return lambda state, k: self.force(state, wind.shaped(blown[k], state.position, moments[k]))
 
@@ -850,7 +850,7 @@ class WindForce(Force):
         wind = self._fields[0]
         assert isinstance(wind, WindField)
         times = _times(time, dt, steps)
-        moment = Moment(times, wind.mean_flow(times), wind.carried(times))
+        moment = wind.moment(times)
         own = [part.per_substep.take(moment) for part in parts if part.per_substep.count]
         return torch.cat([_blow(wind, times), *map(torch.as_tensor, own)], dim=-1)
 

@@ -237,7 +237,7 @@ class CarriedField(Tabulated):
         place = self.anchor - (self.place + self.start + moment.carried) @ self.axes.T
         parts = zip(place.unbind(-1), (self.sizes * self.step).unbind(), self.wraps, strict=True)
         place = torch.stack([x.remainder(side) if wraps else x for x, side, wraps in parts], dim=-1)
-        return torch.cat([place / self.step, torch.zeros_like(place[:, :1]) + self.strength(moment.flow)], dim=-1)
+        return torch.cat([place / self.step, moment.gusts[:, None] * self.strength(moment.flow)], dim=-1)
 
     def strength(self, flow: Tensor) -> Tensor | float:
         """Factor of the velocities in a mean flow [m/s], shape (n, 3); shape (n, 1), or one number."""

@@ -94,6 +94,8 @@ def test_a_part_of_a_run_at_another_rate_and_as_a_skin(run, tmp_path, capsys):
     assert main([run, str(tmp_path / "flag.glb"), "--bones", "6"]) == 0
     assert "6 bones, " in capsys.readouterr().out
     assert len(read_gaussians(tmp_path / "flag.glb").means) == whole
+    assert main([run, str(tmp_path / "mesh.glb"), "--bones", "6", "--proxy"]) == 0
+    assert b"KHR_gaussian" not in (tmp_path / "mesh.glb").read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -104,6 +106,7 @@ def test_a_part_of_a_run_at_another_rate_and_as_a_skin(run, tmp_path, capsys):
         (["f_#.ply", "--box", "5", "5", "5", "6", "6", "6"], "holds no Gaussian"),
         (["f_#.ply", "--bones", "6"], "--bones is not for the frames of a run as .ply"),
         (["f.glb", "--bones", "1"], "from 2 to 256"),
+        (["f.glb", "--proxy"], "--proxy is a mesh that bones move"),
         (["f.glb", "--bones", "6", "--apart"], "--apart cannot be combined"),
         (["f_#.ply", "--box", "0", "-1", "0", "1", "1", "1", "--apart"], "--apart cannot be combined"),
     ],

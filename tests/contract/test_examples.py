@@ -25,7 +25,7 @@ def test_there_are_thirty_and_more_of_at_most_forty_lines_each_with_a_check_and_
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_an_example_runs_to_its_check(path, tmp_path, monkeypatch):
-    needed = {"sweep_to_dataset": "webdataset", "newton_cloth": "newton", "blender_mesh": "bpy"}
+    needed = {"sweep_to_dataset": "webdataset", "newton_cloth": "newton", "newton_mpm": "newton", "blender_mesh": "bpy"}
     if path.stem in needed:
         pytest.importorskip(needed[path.stem])
     monkeypatch.chdir(tmp_path)

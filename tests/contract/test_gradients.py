@@ -101,6 +101,11 @@ def test_a_flow_keeps_its_gradient():
     wind = WindField(schedule=[FlowKey(0.0, [0.0, 2.0, 0.0]), FlowKey(1.0, later)], interpolation="linear")
     wind(0.25).sum().backward()
     torch.testing.assert_close(later.grad, torch.full((3,), 0.25, dtype=DOUBLE))
+    keys = _leaf([4.0, 90.0, 2.0])
+    sway = [SineSway(0.5, 1.0)]
+    wind = WindField(schedule=[FlowKey(0.0, None, *keys)], modulations=sway)
+    wind(0.25)[1].backward()  # speed (1 + gusts / 2)
+    torch.testing.assert_close(keys.grad, double([2.0, 0.0, 2.0]))
 
 
 def test_a_coefficient_that_is_zero_has_a_slope():

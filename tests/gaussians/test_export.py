@@ -18,7 +18,8 @@ from gaussian_swaying.gaussians.formats import (
     read_gaussians,
 )
 from gaussian_swaying.gaussians.usd import usd_arrays, write_usd
-from gaussian_swaying.geometry.rotations import quat_to_rotation
+from gaussian_swaying.geometry.covariances import covariance
+from gaussian_swaying.geometry.rotations import quat_to_rotation, rotation_to_quat
 
 
 def test_one_bad_value_does_not_empty_the_file(tmp_path):
@@ -107,6 +108,29 @@ def test_usd_round_trip(tmp_path):
     reach = 3 * shape.square().sum(-1).sqrt()
     np.testing.assert_allclose(low, (clouds[3].means - reach).amin(0).numpy(), atol=1e-5)
     np.testing.assert_allclose(high, (clouds[3].means + reach).amax(0).numpy(), atol=1e-5)
+
+
+def test_usd_has_samples_of_shapes_only_where_one_is_seen_to_change(tmp_path):
+    usd = pytest.importorskip("pxr.Usd")
+    cloud = replace(varied_cloud(20), normals=None)
+    clouds = [cloud]
+    for k, angle in enumerate([4e-5, 8e-5, 4e-3, 4e-3]):  # rad, about x
+        turn = torch.tensor([math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0]).expand(20, 4)
+        quats = rotation_to_quat(quat_to_rotation(turn) @ quat_to_rotation(cloud.quats))
+        turned = replace(_moved(cloud, 0.1 * k + 0.1), quats=quats)
+        if k == 1:  # other numbers for the same shapes
+            turned = replace(turned, quats=-quats, scales=cloud.scales + 1e-5)
+        clouds.append(turned)
+    write_usd(tmp_path / "film.usdc", clouds)
+    stage = usd.Stage.Open(str(tmp_path / "film.usdc"))
+    prim = stage.GetPrimAtPath("/World/Gaussians")
+    samples = {name: prim.GetAttribute(name).GetTimeSamples() for name in ("positions", "orientations", "scales")}
+    assert samples == {"positions": [0, 1, 2, 3, 4], "orientations": [0, 2, 3], "scales": [0]}
+    for k, wanted in enumerate(clouds):
+        found = {name: torch.from_numpy(array) for name, array in read_usd_frame(tmp_path / "film.usdc", k).items()}
+        shape, known = covariance(found["orientations"], found["scales"].log()), covariance(wanted.quats, wanted.scales)
+        assert ((shape - known).abs().amax((1, 2)) <= 1e-3 * known.diagonal(dim1=1, dim2=2).sum(1)).all()
+        assert_close(found["positions"], wanted.means)
 
 
 def test_usd_keeps_the_place_of_a_gaussian_that_is_not_finite(tmp_path):

@@ -9,7 +9,7 @@ from shared import value_error
 from small_films import changed
 
 from gaussian_swaying.inverse.plan import Unknown, apart_by, check_unknowns, mirrored, mirrored_place, read_unknown
-from gaussian_swaying.simulation.model import flow_of
+from gaussian_swaying.wind.field import flow_of
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")
 

@@ -89,6 +89,32 @@ def test_modulations_are_edited_added_and_removed(panel, monkeypatch):
     assert _value(panel, "wind.modulations.0.period") == 3.0
 
 
+def _tracks(panel):
+    control = panel.names()["wind.schedule"]
+    assert [track["name"] for track in control["tracks"]] == list(control["value"]["keys"])
+    return control["value"]["keys"]
+
+
+def test_the_timeline_keeps_what_it_does_not_show(panel):
+    session = panel.session
+    assert _tracks(panel) == {"speed": [], "azimuth": [], "gusts": []}
+    session.change({"wind.schedule": [{"time": 0.0, "flow": [1.0, 0.0, 1.0]}]})
+    in_turn(session)
+    _set(panel, "wind.schedule", {"keys": {"gusts": [[0.0, 2.0], [1.0, 0.5]]}})
+    keys = session.settings.wind.schedule
+    assert [(key.time, key.flow, key.gusts) for key in keys] == [(0.0, [1.0, 0.0, 1.0], 2.0), (1.0, None, 0.5)]
+    assert session.settings.wind.interpolation == "step"  # as it was
+    before = _value(panel, "wind.azimuth")
+    _set(panel, "wind.flow", [0.0, 0.0, 0.0])  # a steady wind leaves the gusts
+    assert _tracks(panel) == {"speed": [], "azimuth": [], "gusts": [[0.0, 2.0], [1.0, 0.5]]}
+    _set(panel, "wind.schedule", {"keys": _tracks(panel) | {"speed": [[3.0, 4.0]]}})
+    assert _tracks(panel)["azimuth"] == [[3.0, before]]  # a calm has no direction of its own
+    panel.set("wind.schedule", {"keys": {"speed": [], "azimuth": [[1.0, 9.0]], "gusts": []}})
+    in_turn(session)
+    assert "No key of `schedule` gives `speed`, and `flow` is zero" in session.problem
+    assert len(_tracks(panel)["speed"]) == 1
+
+
 def test_a_known_material_is_taken_but_for_its_thickness(panel):
     session, rubber = panel.session, MATERIALS["rubber"]
     assert _value(panel, "material") == OWN

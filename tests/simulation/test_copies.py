@@ -150,7 +150,7 @@ def test_a_wind_that_varies_in_space_is_that_at_the_place():
 
 def test_a_delay_is_the_same_wind_later():
     """A moment of the schedule lies within a substep, so that rounding of times does not decide about one."""
-    keys = [FlowKey(0.0, [0.0, 0.0, 0.0]), FlowKey(0.041, [6.0, 1.5, 0.0])]
+    keys = [FlowKey(0.0, [0.0, 0.0, 0.0]), FlowKey(0.041, [6.0, 1.5, 0.0], gusts=0.5), FlowKey(0.121, gusts=1.0)]
     wind = WindField(schedule=keys, modulations=[UniformGust(0.5)], seed=2)
     frames = list(_simulation([Copy(), Copy(delay=0.08)], wind, solver={"substep": 0.002}, dtype="float64").frames(7))
     late = frames[6].state.position[1]

@@ -24,7 +24,7 @@ from gaussian_swaying.wind.effects import (
 )
 from gaussian_swaying.wind.tables import Shelter, deposited, extinction, wind_axes
 
-NOW = Moment(double(0.0), torch.zeros(3).double(), torch.zeros(3).double())
+NOW = Moment(double(0.0), torch.zeros(3).double(), torch.zeros(3).double(), double(1.0))
 
 
 def speeds(profile, heights):
@@ -156,7 +156,7 @@ def carlson_rd(x, y, z):
 
 def around(obstacle, flow, place):
     """The flow of a wind round an obstacle without a wake."""
-    return obstacle(flow, place, Moment(flow[0], flow, flow))
+    return obstacle(flow, place, Moment(flow[0], flow, flow, flow[0]))
 
 
 def cylinder(axis, radius):
@@ -268,7 +268,8 @@ def test_obstacles_in_a_frame_are_those_of_the_scene(turn):
     frame = SimFrame(double([1.0, 2.0, 3.0]), rotation, 2.0)
     scene = double([[1.9, 2.6, 3.2], [0.4, 1.2, 2.4]])
     flow = double([1.0, 0.3, -0.2])
-    here, there = Moment(flow[0], flow, flow), Moment(flow[0], flow @ rotation.T, 2 * flow @ rotation.T)
+    here = Moment(flow[0], flow, flow, flow[0])
+    there = Moment(flow[0], flow @ rotation.T, 2 * flow @ rotation.T, flow[0])
     for obstacle in (
         Obstacle([1.0, 2.5, 3.0], [0.4, 0.4, None], [-45.0, 0.0, 0.0]),
         Obstacle([1.0, 2.5, 3.0], [0.2, 0.5, 0.4], rotation=[0.0, 0.0, turn], drag=0.0),

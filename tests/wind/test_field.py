@@ -10,7 +10,7 @@ from gaussian_swaying import GaussianGust, SineSway, UniformGust, WindField
 from gaussian_swaying._fixed import assign, changed
 from gaussian_swaying.kernels.derive import on_tensors
 from gaussian_swaying.wind.effects import Profile
-from gaussian_swaying.wind.field import FlowKey, counter_uniform, stream_start
+from gaussian_swaying.wind.field import WITHIN, FlowKey, counter_uniform, stream_start
 
 
 def test_counter_generator_is_pinned():
@@ -55,7 +55,7 @@ def _gusty(k):
 
 
 def _scheduled(k, interpolation):
-    keys = [FlowKey(0.5 * j + 0.1 * k, [1.0 * j + k, 2.0, -j]) for j in range(1 + k)]
+    keys = [FlowKey(0.5 * j + 0.1 * k, [1.0 * j + k, 2.0, -j], gusts=0.5 * j + k) for j in range(1 + k)]
     return WindField(schedule=keys, interpolation=interpolation, modulations=[GaussianGust()], seed=k)
 
 
@@ -83,10 +83,11 @@ def test_the_kernel_modulates_as_torch_does(kernel_device):
     for wind in (_gusty(2), WindField.together([_gusty(k) for k in range(1, 4)]), _scheduled(2, "linear")):
         moved, expected = deepcopy(wind).to(kernel_device), wind(times)
         for _ in range(2):
-            flow, at = moved.mean_flow(times.to(kernel_device)), times.to(kernel_device)
+            at = times.to(kernel_device)
+            flow, gusts = moved.mean_flow(at), moved.strength(at)
             at = at.reshape(-1, *[1] * (flow.ndim - 2)).expand(flow.shape[:-1])
             assert moved._known_rows(at)
-            assert_close(moved.modulated(flow, at).cpu(), expected, rtol=1e-11, atol=1e-12)
+            assert_close(moved.modulated(flow, at, gusts.expand(at.shape)).cpu(), expected, rtol=1e-11, atol=1e-12)
             assert_close(moved(times.to(kernel_device)).cpu(), expected, rtol=1e-11, atol=1e-12)
             if wind.scenes is None:
                 assign(moved, seed=5)
@@ -131,6 +132,34 @@ def test_schedule_steps_and_ramps():
     assert ramp(torch.linspace(0, 1, 7, dtype=torch.float64)).shape == (7, 3)
 
 
+def test_speed_direction_and_gusts_are_curves_of_their_own():
+    """Each goes through the keys that give it; a turn goes the shorter way, and a gust comes when it is asked for."""
+    keys = [FlowKey(0.0, gusts=0.0), FlowKey(1.0, speed=2.0), FlowKey(2.0, azimuth=170.0)]
+    keys += [FlowKey(3.0, speed=6.0, gusts=2.0), FlowKey(4.0, azimuth=-150.0)]
+    gust = SineSway(0.5, 4.0, -math.pi / 2)  # greatest every second second
+    wind = WindField([0.0, 1.0, 1.0], keys, interpolation="linear", modulations=[gust])
+    times = torch.linspace(-1.0, 5.0, 601, dtype=torch.float64)
+    speed, azimuth = 2 + 2 * (times - 1).clamp(0, 2), (170 + 20 * (times - 2).clamp(0, 2)).deg2rad()
+    expected = speed[:, None] / math.sqrt(2) * torch.stack([azimuth.cos(), azimuth.sin(), torch.ones(601)], -1)
+    near(wind.mean_flow(times), expected, 6 * WITHIN)
+    near(wind.mean_flow(double([2.0, 4.0])), expected[[300, 500]], 1e-12)
+    near(wind.strength(times), 2 * times.clamp(0, 3) / 3, 1e-12)
+    steps = WindField(schedule=[FlowKey(0.0, speed=1.0, azimuth=0.0), FlowKey(1.0, azimuth=90.0, gusts=3.0)])
+    near(steps(double([0.9, 1.0])), double([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), 1e-12)
+    assert steps.strength(double([0.0, 2.0])).tolist() == [3.0, 3.0]
+
+
+def test_the_strength_multiplies_what_is_added_to_the_mean():
+    times = torch.linspace(0.0, 1.0, 21, dtype=torch.float64)
+    plain, keys = _gusty(2), [FlowKey(0.0, gusts=0.0), FlowKey(1.0, gusts=2.0)]
+    wind = WindField(plain.flow, keys, interpolation="linear", modulations=plain.modulations, seed=plain.seed)
+    near(wind(times) - plain.flow, 2 * times[:, None] * (plain(times) - plain.flow), 1e-13)
+    assert torch.equal(WindField(plain.flow, keys[:1], modulations=plain.modulations)(times), plain.flow.expand(21, 3))
+    assert torch.equal(wind.with_flow([1.0, 0.0, 0.0]).strength(times), wind.strength(times))
+    for given in (plain, wind):
+        assert given.flow.tolist() == [5.0, 1.0, 0.0]
+
+
 def test_bad_settings_are_refused():
     for kind, given, field in (
         (WindField, {"flow": [1.0, 2.0]}, "flow"),
@@ -138,6 +167,8 @@ def test_bad_settings_are_refused():
         (WindField, {"schedule": [FlowKey(0, [1, 2])]}, "schedule.flow"),
         (WindField, {"schedule": [FlowKey(1, [0] * 3), FlowKey(1, [0] * 3)]}, "schedule"),
         (WindField, {"interpolation": "cubic"}, "interpolation"),
+        (WindField, {"schedule": [FlowKey(0, speed=-1.0)]}, "schedule.speed"),
+        (WindField, {"schedule": [FlowKey(0, gusts=-1.0)]}, "schedule.gusts"),
         (GaussianGust, {"std": -1}, "std"),
         (GaussianGust, {"interval": 0}, "interval"),
         (UniformGust, {"delta": -0.1}, "delta"),
@@ -145,6 +176,21 @@ def test_bad_settings_are_refused():
     ):
         with value_error(f"{field}`"):
             kind(**given)
+
+
+@pytest.mark.parametrize(
+    ("words", "keys"),
+    [
+        ("either `flow`, or `speed` and `azimuth`, not both", [FlowKey(0.0, [1.0, 0.0, 0.0]), FlowKey(1.0, speed=2.0)]),
+        ("either `flow`, or `speed` and `azimuth`, not both", [FlowKey(0.0, [1.0, 0.0, 0.0], azimuth=2.0)]),
+        ("No key of `schedule` gives `speed`, and `flow` is zero", [FlowKey(0.0, azimuth=2.0)]),
+        ("No key of `schedule` gives `azimuth`, and `flow` is zero", [FlowKey(0.0, speed=2.0)]),
+        ("only a time at 1 s: add one of flow, speed, azimuth, gusts", [FlowKey(0.0, gusts=1.0), FlowKey(1.0)]),
+    ],
+)
+def test_keys_that_do_not_fit_are_refused(words, keys):
+    with value_error(words):
+        WindField(schedule=keys)
 
 
 # ---- statistics of what is drawn, not of the substep at which it is read

@@ -60,7 +60,7 @@ def test_a_recorded_wind_repeats(tmp_path):
 def test_places_of_the_file_are_in_metres_and_its_origin_in_scene_units(tmp_path):
     frame = SimFrame(double([1.0, 0.0, 0.0]), EYE, 2.0)
     moved = RecordedWind(_npz(tmp_path / "w.npz"), origin=[2.0, 0.5, 0.0]).in_frame(frame)
-    moment = Moment(double(0.0), double([0.0] * 3), double([0.0] * 3))
+    moment = Moment(double(0.0), double([0.0] * 3), double([0.0] * 3), double(1.0))
     found = moved(torch.zeros(3), double([[2.5, 1.2, 0.4]]), moment)
     np.testing.assert_allclose(found[0].numpy(), _linear(5.0, 0.5, 0.2, 0.4), atol=2e-6)
 

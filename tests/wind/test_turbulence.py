@@ -292,11 +292,10 @@ def test_turbulence_is_carried_by_the_mean_wind():
     first = wind.at(now, place)
     near(wind.at(later, place + (later - now) * flow), first, 1e-10)
     assert peak(wind.at(later, place) - first) > 0.5
-    moment = Moment(now, flow, wind.carried(now))
-    still = wind.effects[0](torch.zeros(3), place, moment)
-    twice = wind.effects[0](torch.zeros(3), place, Moment(now, 2 * flow, wind.carried(now)))
+    still = wind.effects[0](torch.zeros(3), place, wind.moment(now))
+    thrice = wind.effects[0](torch.zeros(3), place, Moment(now, 2 * flow, wind.carried(now), double(1.5)))
     assert_close(first, flow + still)
-    assert_close(twice, 2 * still)
+    assert_close(thrice, 3 * still)
 
 
 def test_the_box_comes_back_at_another_place():
@@ -317,7 +316,7 @@ def test_the_box_comes_back_at_another_place():
 
 @pytest.mark.parametrize("interpolation", ["step", "linear"])
 def test_air_is_carried_by_a_changing_flow(interpolation):
-    keys = [FlowKey(1.0, [2.0, 0.0, 0.0]), FlowKey(2.0, [0.0, 4.0, 0.0]), FlowKey(4.0, [1.0, 1.0, 1.0])]
+    keys = [FlowKey(1.0, [2.0, 0.0, 0.0]), FlowKey(2.0, [0.0, 4.0, 0.0]), FlowKey(4.0, [1.0, 1.0, 1.0], gusts=2.0)]
     wind = WindField(schedule=keys, interpolation=interpolation)
     fine = torch.arange(0, 6, 1e-3, dtype=torch.float64)
     flows = wind.mean_flow(fine + 5e-4)
@@ -335,7 +334,7 @@ def test_a_field_that_does_not_repeat_goes_on_outside():
     field = field.along(torch.tensor([2.0, 0.0, 0.0]))
     still = torch.zeros(3).double()
     place = double([[0.0, -3.0, 0.0], [100.3, 0.25, 9.0], [0.0, 3.0, 0.0]])
-    found = field(torch.zeros(3), place, Moment(still[0], still, still))
+    found = field(torch.zeros(3), place, Moment(still[0], still, still, double(1.0)))
     assert_close(found[:, 0], double([1.0, 3.0, 5.0]))
     with value_error("Expected `table` of shape"):
         CarriedField(torch.zeros(4, 2, 2), [1.0] * 3)

@@ -26,7 +26,7 @@ TOLERANCE = 2e-5
 """Of kernels, relative to the largest value of a field, as in tests/mpm/kernels/bodies.py."""
 GUSTS = WindField([3.0, 1.0, 0.0], modulations=[UniformGust(0.5, interval=1.5 * DT)])
 RISING = WindField(schedule=[FlowKey(0.0, [0.0] * 3), FlowKey(4 * DT, [0.0, 20.0, 0.0])], interpolation="linear")
-TURNING = [FlowKey(0.0, [4.0, 1.0, 0.5]), FlowKey(3 * DT, [-2.0, 3.0, 0.0])]
+TURNING = [FlowKey(0.0, [4.0, 1.0, 0.5], gusts=0.2), FlowKey(3 * DT, [-2.0, 3.0, 0.0]), FlowKey(5 * DT, gusts=2.0)]
 MIDDLE = [0.1, 0.15, 0.1]
 ZERO = double(0.0)
 

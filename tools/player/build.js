@@ -4,7 +4,7 @@ import { build } from "esbuild";
 import { createHash } from "node:crypto";
 import { readFile } from "node:fs/promises";
 
-const OWN = "brush.js build.js bundle.js film.glsl.js film.js gaussians.js live.js main.js panel.js playback.js sorter.js tunnel.js view.js".split(" ");
+const OWN = "brush.js build.js bundle.js film.glsl.js film.js gaussians.js live.js main.js panel.js playback.js sorter.js timeline.js tunnel.js view.js".split(" ");
 OWN.push("live_web/page.js");
 const SOLVER = "block.js body.js modal.js solver.js webgpu.js wind.js worker.js"
   .split(" ")

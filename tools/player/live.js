@@ -7,6 +7,7 @@ import { View } from "./view.js";
 
 const SLOW = 3; // pictures a second; a browser that draws fewer gets pictures from the server
 const PATIENCE = 4000; // ms, until that is decided
+const NARROW = 1100; // pixels, as in player.html
 const AGAIN = 1000; // ms until a connection that broke is opened again
 
 // ---- messages, see gaussian_swaying/player/server.py
@@ -36,6 +37,7 @@ class Live {
     this.view = new View(canvas, { draws: tested !== null });
     const action = (kind, text, label) => button(kind, text, label, () => this.say({ kind }));
     const further = [action("step", "Step", "Advance by one step"), action("undo", "Undo", "Take the last change back")];
+    further.push(button("curves", "Timeline", "Speed, direction and gusts over time", () => this.openTimeline(element("timeline").hidden)));
     this.tunnel = new Tunnel(this.view, (message) => this.say(message), (name, value) => this.set(name, value), further);
     this.brush = new Brush(this.view, (message) => this.say(message));
     this.own = { show: "color", server: false, part: "held", radius: 20, through: false, how: "what is connected" };
@@ -135,6 +137,12 @@ class Live {
     element("note").hidden = !sentence;
   }
 
+  openTimeline(on) {
+    element("timeline").hidden = !on;
+    if (on && innerWidth <= NARROW) this.tunnel.open(false); // there is room for one
+    element("curves").setAttribute("aria-expanded", String(on));
+  }
+
   showFigures(figures) {
     this.figures = figures;
     const { loading, notice, problem, broken, paused, speed, rate, pictures, stretch } = figures;
@@ -186,6 +194,8 @@ class Live {
     ];
     groups.push({ name: "Files", controls: files, shut: true });
     this.tunnel.show(groups);
+    element("curves").disabled = !this.tunnel.panel.timeline;
+    if (!this.tunnel.panel.timeline) this.openTimeline(false);
     this.brush.set({ on: painting?.on ?? false, ...own });
     this.showLegend();
     if (this.hash !== undefined) return;
@@ -225,7 +235,7 @@ class Live {
     else if (name === "load") this.file.click();
     else if (["parts.npz", "live.yaml"].includes(name)) this.download(name);
     else this.say({ kind: "set", name, value });
-    if (value === null || name === "paint") this.tunnel.changed.delete(name);
+    if (value === null || ["paint", "wind.schedule"].includes(name)) this.tunnel.changed.delete(name);
   }
 
   download(name) {

@@ -1,4 +1,6 @@
 // The controls of a page, made from descriptions: name, label, kind, ends, unit and value of each. See gaussian_swaying/player/panel.py.
+import { Timeline } from "./timeline.js";
+
 const HOLD = 800; // ms in which a control that was just used keeps its value, whatever the server says
 const STEPS = 200; // of a slider
 const STEP = 0.5; // m/s of an arrow key on the dial
@@ -147,7 +149,7 @@ export class Panel {
     this.changed = changed;
     this.controls = new Map();
     this.shape = "";
-    this.dial = null;
+    this.dial = this.timeline = null;
     this.turn = 0;
   }
 
@@ -162,6 +164,7 @@ export class Panel {
   build(groups) {
     const open = new Map([...element("controls").querySelectorAll("details")].map((part) => [part.dataset.name, part.open]));
     this.controls.clear();
+    this.timeline = null;
     element("controls").replaceChildren();
     for (const { name, controls, shut } of groups) {
       const part = make("details", { open: open.get(name) ?? !shut }, make("summary", { textContent: name }));
@@ -184,6 +187,11 @@ export class Panel {
       known.show = (flow) => this.dial.show(flow, this.turn);
       return;
     }
+    if (control.kind === "timeline") {
+      this.timeline = new Timeline(control, changed);
+      known.show = (value) => this.timeline.show(value);
+      return;
+    }
     const { parts, show, named } = KINDS[control.kind](control, changed);
     known.show = show;
     for (const input of named) {
@@ -194,10 +202,16 @@ export class Panel {
     part.append(make("div", { className: "row" }, ...parts));
   }
 
-  /** Show the value of a control, unless it was used a moment ago. */
+  /** Show the value of a control; if it was used a moment ago, a moment later. */
   put(name, value) {
     const known = this.controls.get(name);
-    if (value === undefined || known === undefined || performance.now() - known.used < HOLD) return;
+    if (value === undefined || known === undefined) return;
+    clearTimeout(known.later);
+    const left = HOLD - (performance.now() - known.used);
+    if (left > 0) {
+      known.later = setTimeout(() => known === this.controls.get(name) && this.put(name, value), left);
+      return;
+    }
     known.value = value;
     known.show(value);
   }

@@ -226,6 +226,7 @@ export class Tunnel {
       view.move((data) => playback.write(data));
     }
     const { camera, controls } = view;
+    this.panel.timeline?.tick(playback.shown);
     this.panel.face(Math.atan2(camera.position.y - controls.target.y, camera.position.x - controls.target.x) + Math.PI / 2);
   }
 

@@ -27,8 +27,7 @@ from gaussian_swaying.mpm.pull import still_pull
 from gaussian_swaying.mpm.run import at_home
 from gaussian_swaying.mpm.shared_kernels import site_forces, squared_stretch
 from gaussian_swaying.mpm.total import Total, TotalRun
-from gaussian_swaying.wind.effects import Moment
-from gaussian_swaying.wind.field import WindField
+from gaussian_swaying.wind.field import BUFFERS, WindField
 from gaussian_swaying.wind.force import AirLift, WindForce
 from gaussian_swaying.wind.tables import CarriedField
 from gaussian_swaying.wind.turbulence import Turbulence
@@ -204,14 +203,13 @@ def _functions(forces: Sequence[Force]) -> list[DeviceFunction]:
 
 
 def blown(wind: WindField) -> tuple[Passes, dict[str, Tensor]]:
-    """The kernel that samples the wind at :data:`MOST_STEPS` times, with its tables: times, velocities, gusts."""
-    times = torch.zeros(MOST_STEPS, dtype=torch.float64)
+    """The kernel that samples the wind at :data:`MOST_STEPS` times; its tables: times, velocities, how gusty."""
+    times = gusts = torch.zeros(MOST_STEPS, dtype=torch.float64)
     with noted() as blow:
         air = wind(times)
-    numbers = times[:0]
     if blow:
-        air, times, numbers, _ = blow[0].tensors
-    return {"blow": blow}, {"times": times, "air": air.contiguous(), "gusts": numbers}
+        air, times, gusts, *_ = blow[0].tensors
+    return {"blow": blow}, {"times": times, "air": air.contiguous(), "gusts": gusts}
 
 
 def _substeps(run: TotalRun, free: dict[str, Any], held: dict[str, Any]) -> Passes:
@@ -264,7 +262,7 @@ def _packed(
         values = (effect.table / unit).round().char()
         small[name] = values.diff(dim=0, prepend=torch.zeros_like(values[:1]))
         packed.append({"name": name, "table": name, "unit": unit, "row": values[0].numel()})
-        at = effect.now(Moment(*torch.zeros(3, 1, 3, dtype=torch.float64)))[0, :3]
+        at = effect.now(wind.moment(torch.zeros(1, dtype=torch.float64)))[0, :3]
         cells = zip(effect.sizes.tolist(), effect.wraps, strict=True)
         carried.append(
             {
@@ -286,8 +284,9 @@ def _packed(
         "widths": [free.width, held.width],
         "pull": [held.per_point[-1][0], held.per_substep[-1][0]],
     }
-    flow = {"times": wind.times.tolist(), "flows": wind.flows.tolist(), "linear": wind.interpolation == "linear"}
-    head = {"kernels": kernels, "packed": packed, "wind": flow | {"carried": carried, "past": past}}
+    keys = {name: getattr(wind, name).tolist() for name in BUFFERS}
+    flow = {**keys, "linear": wind.interpolation == "linear", "carried": carried, "past": past}
+    head = {"kernels": kernels, "packed": packed, "wind": flow}
     fused, plain = image.modules
     parts = {"image": image.memory, "fusedCode": fused, "plainCode": plain}
     return head, small | {name: _bytes(part) for name, part in parts.items()}, image.place

@@ -50,7 +50,7 @@ PLANE = {"class_path": "Wall", "init_args": {"shape": BELOW, "friction": 0.4}}
 CLAMP = {"class_path": "PinnedRegion", "init_args": {"region": SIDE, "kind": "clamp"}}
 NODES = {"class_path": "PinnedRegion", "init_args": {"region": SIDE, "kind": "nodes"}}
 POINT = {"class_path": "PinnedPoints", "init_args": {"at": [[0.0, 0.0, 0.4]]}}
-FLOWS = [{"time": 0.1, "flow": [1, 1, 0]}, {"time": 0.3, "flow": [0, 3, 0]}]
+FLOWS = [{"time": 0.1, "flow": [1, 1, 0], "gusts": 0.5}, {"time": 0.3, "flow": [0, 3, 0]}, {"time": 0.4, "gusts": 3}]
 SOFT = {"region": {"class_path": "Box", "init_args": {"min": [0.3, None, None], "max": [None] * 3}}, "E": 1e4}
 
 
@@ -87,7 +87,7 @@ CASES = {
     "bending": {"material": {"bending": "plate", "E": 1e5}},
     "a law of one's own": {"material": {"law": law(f"{__name__}.Own")}},
     "carried air, and its weight": {"aero": {"added_mass": 0.5}, "solver": {"gravity": [0.0, 1.0, -9.8]}},
-    "effects": {"wind": {"effects": EFFECTS}},
+    "effects": {"wind": {"effects": EFFECTS, "interpolation": "linear", "schedule": FLOWS}},
     "nodes and a point, still air": {
         "solver": {"boundaries": [NODES, POINT]},
         "aero": {"C_D": 0.0, "C_F": 0.0, "C_L": 0.0},
