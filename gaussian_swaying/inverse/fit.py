@@ -598,7 +598,8 @@ def fit(
         videos: Folders with transforms.json, see :func:`~gaussian_swaying.inverse.videos.read_videos`.
         unknowns: For each unknown its range, such as ``{"wind.speed": [1, 10]}``, or ``{"range": [1, 10], "scale":
             "log", "start": 3}``.
-        output: Folder for the results, in which a fit may be continued (``resume``).
+        output: Folder for the results.
+        resume: Continue the fit that was stopped in ``output``.
         device: ``auto``, ``cpu`` or ``cuda``.
         progress: Print a line for each step, and a bar.
         settings: Further fields of :class:`~gaussian_swaying.inverse.plan.Plan`, such as ``known`` and ``until``.
