@@ -219,7 +219,7 @@ class Simulation(Fixed):
         settings, material = as_scene(scene, up), as_material(material)
         cloud = settings.cloud() if cloud is None else cloud  # read once
         solver = as_solver(solver, hold, settings, cloud, damping)
-        self._made_with = given | {"solver": solver, "hold": None}
+        self._made_with: dict[str, Any] | None = given | {"solver": solver, "hold": None}
         if normalisation is not None:
             if hold is not None:
                 raise ValueError("`hold` cannot be combined with `normalisation`: give a solver with the pins.")
@@ -432,7 +432,7 @@ class Simulation(Fixed):
         other._painter = changed(self._painter, stepper=other._stepper)
         other._editor = SceneEditor(other._stepper, self._editor.edits)
         other._recorder, other._files = self._recorder_or(recorder), []
-        other.config = config
+        other.config, other._made_with = config, None
         return other
 
     def batch(self, models: Sequence[Model]) -> Stepper:
@@ -494,6 +494,8 @@ class Simulation(Fixed):
         if self._changes():
             changes = ", ".join(f"`{name}`" for name in self._changes())
             raise ValueError(f"{changes} changed after the simulation was made: make it with the new values instead.")
+        if self._made_with is None:
+            raise ValueError("A variant cannot be made on another grid: make a simulation with its values instead.")
         solver = self._made_with["solver"]
         coarser = solver.like(replace(solver.settings, dx=ratio * solver.dx))
         return type(self)(**self._made_with | {"solver": coarser, "device": self.device})

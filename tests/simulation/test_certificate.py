@@ -116,6 +116,7 @@ def test_what_cannot_be_certified_is_refused_before_the_run(tmp_path):
     changed.change("wind.speed", 3.0)
     cases = {
         "`wind` changed": (changed, {}),
+        "A variant cannot": (_flag().variant({"wind.speed": 3.0}), {}),
         "leave out `resume`": (_flag(), {"resume": True}),
         "leave out `copies`": (_flag(copies=[Copy([0.0, 2.0, 0.0])]), {}),
     }
