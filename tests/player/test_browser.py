@@ -285,6 +285,26 @@ def test_the_bar_and_the_panel_steer_the_session(page, drawing):
     assert window.problems == []
 
 
+def test_a_field_that_is_left_sends_what_was_typed_alone(page, drawing):
+    """Not what the page has written into it since."""
+    session, window = page.session, drawing
+    window.get_by_role("button", name="Controls").click()
+    field = window.locator("input[type=number][name='wind.speed']")
+    field.fill("12")
+    field.press("Enter")
+    until(lambda: session.simulation.wind.flows.norm() > 11.9)
+    window.keyboard.press("Control+z")  # in the field, too
+    until(lambda: session.simulation.wind.flows.norm() < 7)
+    session.change({"wind.flow": [9.0, 0.0, 0.0]})
+    until(lambda: field.input_value() == "9")
+    window.evaluate("() => { window.said = []; wind.say = (what) => said.push(what); }")
+    field.blur()
+    assert "set" not in window.evaluate("said.map((what) => what.kind)")
+    field.fill("8")
+    field.blur()
+    assert {"kind": "set", "name": "wind.speed", "value": 8} in window.evaluate("said")
+
+
 def test_a_window_records_what_it_shows(page, drawing, tmp_path):
     iio, window = pytest.importorskip("imageio.v3"), drawing
     window.get_by_role("button", name="Controls").click()

@@ -100,6 +100,19 @@ class Dial {
   }
 }
 
+/** A field for a number that calls back when someone has typed one, not when it is left with the number it was given meanwhile. */
+function numberField({ low, high }, changed) {
+  const field = make("input", { type: "number", min: low, max: high, step: "any" });
+  let typed = false;
+  field.addEventListener("input", () => (typed = true));
+  field.addEventListener("change", () => typed && Number.isFinite(field.valueAsNumber) && changed(field.valueAsNumber));
+  const show = (now) => {
+    field.value = short(now);
+    typed = false;
+  };
+  return { field, show };
+}
+
 /** What each kind of control has: its elements, how it shows a value, and what it calls when it is used. */
 const KINDS = {
   range(control, changed) {
@@ -107,10 +120,10 @@ const KINDS = {
     const [place, value] = log ? [Math.log10, (at) => 10 ** at] : [Number, Number];
     const [first, last] = [place(low), place(high)];
     const slider = make("input", { type: "range", min: first, max: last, step: log ? (last - first) / STEPS : "any" });
-    const field = make("input", { type: "number", min: low, max: high, step: "any" });
+    const { field, show: fill } = numberField(control, changed);
     const show = (now) => {
       slider.value = String(place(Math.min(Math.max(now, low), high)));
-      field.value = short(now);
+      fill(now);
       slider.setAttribute("aria-valuetext", `${short(now)} ${unit}`);
     };
     slider.addEventListener("input", () => {
@@ -118,14 +131,12 @@ const KINDS = {
       show(now);
       changed(now);
     });
-    field.addEventListener("change", () => Number.isFinite(field.valueAsNumber) && changed(field.valueAsNumber));
     return { parts: [make("label", {}, make("span", { textContent: unit ? `${control.label} [${unit}]` : control.label }), field), slider], show, named: [slider, field] };
   },
   number(control, changed) {
-    const field = make("input", { type: "number", min: control.low, max: control.high, step: "any" });
-    field.addEventListener("change", () => Number.isFinite(field.valueAsNumber) && changed(field.valueAsNumber));
+    const { field, show } = numberField(control, changed);
     const text = control.unit ? `${control.label} [${control.unit}]` : control.label;
-    return { parts: [make("label", {}, make("span", { textContent: text }), field)], show: (now) => (field.value = short(now)), named: [field] };
+    return { parts: [make("label", {}, make("span", { textContent: text }), field)], show, named: [field] };
   },
   choice(control, changed) {
     const list = make("select", {}, ...control.options.map((value) => make("option", { value, textContent: value || "…" })));
