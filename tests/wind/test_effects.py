@@ -22,7 +22,7 @@ from gaussian_swaying.wind.effects import (
     WindEffect,
     wake_start,
 )
-from gaussian_swaying.wind.tables import Shelter, deposited, extinction, wind_axes
+from gaussian_swaying.wind.tables import Shelter, deposited, wind_axes
 
 NOW = Moment(double(0.0), torch.zeros(3).double(), torch.zeros(3).double(), double(1.0))
 
@@ -335,19 +335,6 @@ def test_a_round_wake_widens_by_a_twentieth():
     assert_close(sigma.diff() / behind.diff(), double([0.05, 0.05]))
 
 
-@pytest.mark.parametrize(("apart", "error"), [(0.5, 1e-14), (10, 1e-14), (1e12, 1e-14), (1e40, 1e-12)])
-def test_carlsons_integral_of_two_equal_arguments(apart, error):
-    """R_D(x, x, z) in closed form (DLMF 19.20.20, 19.2.18), with z = 1 + apart in units of x.
-
-    To some roundings; at 1e40 the first two terms of the series are 2.5e-8 and 2.2e-11, those left out 3.2e-13.
-    """
-    x = double(0.7)
-    found = float(carlson_rd(x, x, x * (1 + apart))) * 0.7**1.5
-    root = math.sqrt(apart)
-    expected = 3 * (math.asinh(root) / root - 1 / math.sqrt(1 + apart)) / apart
-    assert found == pytest.approx(expected, rel=error, abs=0)
-
-
 def _slab(depth, drag, direction, cells=32):
     """A slab of leaves that all face the wind, 1 m deep and 0.8 m wide, of an optical depth; and its particles."""
     side = 40
@@ -425,21 +412,6 @@ def test_deposits_are_shared_and_do_not_depend_on_the_order():
     assert single[1, 2, 4] == 6.0
     assert single[2, 2, 4] == 2.0
     assert peak(deposited(place, torch.zeros(5000), 6)) == 0.0
-
-
-def test_extinction_is_the_trapezoidal_sum():
-    density = double([1.0, 3.0, 0.0, 2.0]).reshape(4, 1, 1)
-    depth = 0.5 * double([0.5, 2.5, 4.0, 5.0])  # spacing 1
-    assert_close(extinction(density, torch.tensor(1.0)).flatten(), torch.exp(-depth))
-
-
-def test_axes_of_a_wind():
-    for flow in ([0.0, 0.0, 0.0], [0.0, 0.0, 3.0], [1.0, -2.0, 0.3]):
-        flow = double(flow)
-        axes = wind_axes(flow)
-        assert_close(axes @ axes.T, EYE)
-        if float(flow.norm()) > 0:
-            assert_close(axes[0], flow / flow.norm())
 
 
 @pytest.mark.parametrize("cells", [3, 300, 8.0])

@@ -19,7 +19,6 @@ from gaussian_swaying.geometry.regions import Box, Capsule, Everything, HalfSpac
 from gaussian_swaying.kernels.launch import lanes
 from gaussian_swaying.mpm import total
 from gaussian_swaying.mpm.state import GridSpec
-from gaussian_swaying.wind.field import FlowKey
 from gaussian_swaying.wind.patches import Patches
 
 from .bodies import (
@@ -367,24 +366,3 @@ def test_what_leaves_the_grid_is_lost(kernel_device):
         return states
 
     check_agreement(run_both(points, run, start=start, gravity=ZERO))
-
-
-@in_both
-def test_a_batch_is_each_scene_by_itself(kernel_device, formulation):
-    points = make_points(kernel_device, count=10, batch=(2,))
-    winds = [WindField([0.0, -8.0, 0.0]), WindField(schedule=[FlowKey(0.0, [1.0, 0, 0]), FlowKey(DT, [9.0, 0, 0])])]
-    load, velocity = make_load(points, winds), 10 * noise(1, 2, 10, 3).to(kernel_device)
-
-    def end(points, velocity, load):
-        solver = make_solver("kernels", formulation)
-        return solver.rollout(solver.init_state(points, velocity), DT, 4, load)
-
-    both = end(points, velocity, load)
-    assert both.work.shape == (2,)
-    for k, wind in enumerate(winds):
-        own = WindForce(load.aero, wind, load.normal[k], load.area[k])
-        alone = end(points.map(lambda value, k=k: value[k]), velocity[k], own)
-        for name in ("position", "velocity", "affine", "F_elastic"):
-            error = peak(getattr(alone, name) - getattr(both, name)[k])
-            assert float(error) <= TOLERANCE * peak(getattr(alone, name)), name
-        torch.testing.assert_close(alone.work, both.work[k], rtol=1e-4, atol=0)
