@@ -193,7 +193,6 @@ def _points(position, e=1e4, nu=0.3, density=100.0):
 
 def test_frame_is_divided_without_losing_a_substep():
     """int(4e-2 / 2e-5) is 1999."""
-    assert int(4e-2 / 2e-5) == 1999
     assert substeps_per_frame(4e-2, 2e-5, exact=True) == 2000
     assert substeps_per_frame(4e-2, 2e-5, exact=False) == 2000
     assert substeps_per_frame(0.04, 0.03, exact=False) == 2

@@ -47,11 +47,6 @@ def test_the_power_law():
     assert found == pytest.approx([8.0, 8.0 * 0.03125**0.2, 0.0])  # 0.03125 is half to the fifth
 
 
-def test_a_roughness_above_the_height_is_refused():
-    with value_error(r"Expected `roughness` .* to be below `height`"):
-        Profile(height=1.0, roughness=2.0)
-
-
 class Flat(WindEffect):
     """Forgets that places have three coordinates, or returns no tensor."""
 
@@ -132,12 +127,6 @@ def test_a_plume_in_scene_units():
     moved = Plume(source=(1.5, 0.0, 0.0), radius=0.1, heat=500.0).in_frame(frame)
     place = [[1.1, 0.2, 0.7]]
     assert_close(plume_at(moved, place), plume_at(Plume((1.0, 0.0, 0.0), 0.2, 500.0), place))
-
-
-@pytest.mark.parametrize("name", ["radius", "heat"])
-def test_a_plume_without_heat_or_width_is_refused(name):
-    with value_error(f"Expected `{name}` to be positive"):
-        Plume(**{name: 0.0})
 
 
 FLOW = double([2.0, -0.7, 0.4])
@@ -221,15 +210,6 @@ def test_ellipsoids_become_spheres_and_cylinders():
     near(long, around(cylinder(z, 0.8), FLOW, place), 1e-9)
 
 
-def test_the_side_of_a_spheroid():
-    """Lamb 104: virtual mass of a prolate spheroid along its axis; the flow at its side is 1 + k times the wind."""
-    e = math.sqrt(1 - 0.25)
-    alpha = 2 * (1 - e * e) / e**3 * (0.5 * math.log((1 + e) / (1 - e)) - e)
-    k = alpha / (2 - alpha)
-    found = around(ellipsoid((1, 0.5, 0.5)), double([1.0, 0, 0]), double([[0.0, 0.5 + 1e-13, 0.0]]))
-    assert found[0].tolist() == pytest.approx([1 + k, 0.0, 0.0], abs=1e-11)
-
-
 def test_carlsons_integral():
     """Values of the paper."""
     x, y, z = (double(v) for v in (1e-300, 2.0, 1.0))
@@ -304,17 +284,21 @@ def test_still_air_stays_still():
 
 
 @pytest.mark.parametrize(
-    ("make", "words"),
+    ("kind", "given", "words"),
     [
-        (lambda: Obstacle([0.0] * 3, [-1.0, -1.0, None]), "`radii` to be positive"),
-        (lambda: Obstacle([0.0] * 3, [1.0] * 3, drag=1.2), "`drag` of an ellipsoid to be below 1"),
-        (lambda: Obstacle([0.0] * 3, [1.0, 2.0, None]), "`radii` of a pole"),
-        (lambda: Obstacle([0.0] * 3, [1.0, 2.0]), "`radii` to have 3 numbers"),
+        (Obstacle, ([0.0] * 3, [-1.0, -1.0, None]), "`radii` to be positive"),
+        (Obstacle, ([0.0] * 3, [1.0] * 3, [0.0] * 3, 1.2), "`drag` of an ellipsoid to be below 1"),
+        (Obstacle, ([0.0] * 3, [1.0, 2.0, None]), "`radii` of a pole"),
+        (Obstacle, ([0.0] * 3, [1.0, 2.0]), "`radii` to have 3 numbers"),
+        (Profile, ((0.0, 0.0, 0.0), 1.0, 2.0), "`roughness` .* to be below `height`"),
+        (Plume, ((0.0, 0.0, 0.0), 0.0), "`radius` to be positive"),
+        (Plume, ((0.0, 0.0, 0.0), 1.0, 0.0), "`heat` to be positive"),
+        *((Shelter, (cells,), "`cells` to be a whole number from 4 to 256") for cells in (3, 300, 8.0)),
     ],
 )
-def test_impossible_obstacles_are_refused(make, words):
+def test_impossible_effects_are_refused(kind, given, words):
     with value_error(words):
-        make()
+        kind(*given)
 
 
 def test_a_plane_wake_has_half_of_its_depth_where_it_was_measured():
@@ -412,12 +396,6 @@ def test_deposits_are_shared_and_do_not_depend_on_the_order():
     assert single[1, 2, 4] == 6.0
     assert single[2, 2, 4] == 2.0
     assert peak(deposited(place, torch.zeros(5000), 6)) == 0.0
-
-
-@pytest.mark.parametrize("cells", [3, 300, 8.0])
-def test_impossible_grids_are_refused(cells):
-    with value_error("`cells` to be a whole number from 4 to 256"):
-        Shelter(cells)
 
 
 def test_a_shelter_that_was_not_refreshed_changes_nothing():
