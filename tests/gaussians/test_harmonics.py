@@ -37,12 +37,6 @@ def _reference_basis(directions, degree):
     return torch.stack(columns, dim=-1)
 
 
-def test_signs_of_the_first_band():
-    """The convention of 3DGS files: -y, z, -x."""
-    basis = sh_basis(torch.eye(3), 1)[:, 1:]
-    assert_close(basis / 0.4886025, torch.tensor([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]]))
-
-
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_evaluation(device, dtype, degree):
     directions = unit(50, 3, device=device, dtype=dtype)

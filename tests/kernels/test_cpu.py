@@ -368,9 +368,3 @@ def test_numbers_and_tensors_of_all_types_are_passed():
         assert float(x) == 16
     with pytest.raises(KeyError, match="uint8"):  # its bytes would be read with a sign
         launch(_advance, (1,))(torch.zeros(1, dtype=torch.uint8), 3)
-
-
-def test_options_of_a_gpu_are_ignored():
-    x = torch.ones(1)
-    launch(_advance, (1,))(x, 2.0, num_warps=4, num_stages=2, maxnreg=128, launch_cooperative_grid=True)
-    assert float(x) == 3.0
