@@ -122,6 +122,7 @@ def test_a_stopped_sweep_ends_in_order(undisturbed, tmp_path, sweep_file, monkey
 
     with monkeypatch.context() as patch:
         patch.setattr(run.Processes, "outcome", stop)
+        patch.setattr(run, "STOP_S", 60.0)  # a worker that has not ended by then is killed, as it would be later
         assert main([str(file), "--output", str(folder), *QUICK]) == 143
     error = capsys.readouterr().err
     assert "Stopped; complete runs are kept" in error
