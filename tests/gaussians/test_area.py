@@ -187,8 +187,3 @@ def test_patch_area_takes_the_two_larger_scales(device, dtype):
     )
     expected = math.pi * torch.tensor([6.0, 6.0, 6.0, 1.0], device=device, dtype=dtype)
     assert_close(patch_area(scales.log()), expected)
-
-
-def test_gradcheck_of_patch_area(device):
-    log_scales = randn(4, 3, device=device, requires_grad=True)
-    assert torch.autograd.gradcheck(patch_area, (log_scales,))

@@ -14,11 +14,7 @@ from gaussian_swaying.gaussians.filling import (
     depth_below,
     enclosed,
     grid_around,
-    odd_crossings,
     open_air,
-    ray_directions,
-    sample,
-    share_volume,
 )
 
 H = 0.05  # m, cells
@@ -128,30 +124,6 @@ def test_a_gaussian_that_blew_up_is_cut_off():
     assert (density > 0).sum() == 5**3
 
 
-@pytest.mark.parametrize("count", [6, 18, 26])
-def test_directions(count):
-    directions = ray_directions(count)
-    assert len(set(directions)) == count
-    assert {tuple(-c for c in d) for d in directions} == set(directions)
-    assert (0, 0, 0) not in directions
-
-
-@pytest.mark.parametrize("direction", ray_directions(26))
-def test_crossings_are_those_of_a_walk(direction):
-    dense = torch.rand(6, 7, 8) < 0.3
-    odd = odd_crossings(dense, direction)
-    for start in torch.cartesian_prod(torch.arange(6), torch.arange(7), torch.arange(8)).tolist():
-        at, before, count = list(start), bool(dense[tuple(start)]), 0
-        while True:
-            at = [a + d for a, d in zip(at, direction, strict=True)]
-            if any(not 0 <= a < n for a, n in zip(at, dense.shape, strict=True)):
-                break
-            now = bool(dense[tuple(at)])
-            count += now and not before
-            before = now
-        assert bool(odd[tuple(start)]) == (count % 2 == 1)
-
-
 def test_votes_decide():
     """A cube with one open face: below it 9 of 26 rays leave, so 17/26 of them say inside."""
     dense = torch.zeros(11, 11, 11, dtype=torch.bool)
@@ -188,22 +160,6 @@ def test_depth_below_a_plane(normal, width):
     if normal[0]:
         assert error.mean().abs() < 0.05
         assert error.std() < 0.25
-
-
-def test_sample_is_trilinear():
-    x, y, z = torch.meshgrid(*(torch.arange(float(n)) for n in (4, 5, 6)), indexing="ij")
-    field = 1 + 2 * x - 3 * y + 0.5 * z + 0.1 * x * y * z
-    p = rand(50, 3) * torch.tensor([3.0, 4.0, 5.0])
-    a, b, c = p.unbind(-1)
-    expected = (1 + 2 * a - 3 * b + 0.5 * c + 0.1 * a * b * c).float()
-    assert_close(sample(field, p, chunk=7), expected, rtol=0, atol=1e-4)
-
-
-def test_volume_is_shared_equally():
-    owner, filled = torch.tensor([0, 0, 2, -1]), torch.tensor([False, True, True])
-    volume, gaussians = share_volume(owner, filled, 6.0)
-    assert volume.tolist() == [6.0, 3.0]
-    assert gaussians.tolist() == [3.0, 3.0, 3.0, 0.0]
 
 
 # ---- bodies

@@ -2,7 +2,7 @@ import pytest
 import torch
 from shared import longest, rand, seeded
 
-from gaussian_swaying.gaussians.grouping import grid_groups, joined, loose_points
+from gaussian_swaying.gaussians.grouping import grid_groups, loose_points
 from gaussian_swaying.geometry.groups import sums
 
 DX = 0.1
@@ -89,9 +89,3 @@ def test_a_thread_holds():
     other = sheet() + torch.tensor([30.0, 0.0, 0.0])
     assert not loose_points(torch.cat([sheet(), row, other]), 1.0).any()
     assert not loose_points(1.7 * row, 1.0)[1:-1].any()
-
-
-def test_joined_numbers_the_parts():
-    pairs = torch.tensor([[0, 4, 2], [4, 5, 6]])
-    assert joined(7, pairs).tolist() == [0, 1, 2, 3, 0, 0, 2]
-    assert joined(2, torch.zeros(2, 0, dtype=torch.long)).tolist() == [0, 1]

@@ -4,13 +4,7 @@ from shared import gradients, value_error
 from small_scenes import varied_cloud
 from torch.testing import assert_close
 
-from gaussian_swaying.gaussians.area import coverage_area, patch_area
-from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
-from gaussian_swaying.gaussians.ply import read_ply
-from gaussian_swaying.geometry.covariances import (
-    covariance,
-)
 from gaussian_swaying.geometry.patches import deform_normal, smallest_axis_normal
 
 
@@ -35,20 +29,6 @@ def test_tensors_are_copied_or_shared(copy):
     assert shared == {"means": not copy, "scales": not copy}
 
 
-@pytest.mark.parametrize("degree", [0, 3])
-@pytest.mark.parametrize("normals", [False, True])
-def test_model_round_trip_through_a_file(tmp_path, degree, normals):
-    cloud = varied_cloud(6, degree, normals=normals)
-    GaussianSurfaceModel.from_cloud(cloud).save_ply(tmp_path / "a.ply")
-    model = GaussianSurfaceModel.from_cloud(read_ply(tmp_path / "a.ply"), requires_grad=False)
-    back = model.to_cloud()
-    for field in ("means", "quats", "scales", "opacities", "sh"):
-        assert torch.equal(getattr(back, field), getattr(cloud, field))
-        assert not getattr(back, field).requires_grad
-    assert torch.equal(back.normals, read_ply(tmp_path / "a.ply").normals)
-    assert not any(parameter.requires_grad for parameter in model.parameters())
-
-
 def test_model_state_dict_round_trip():
     cloud = varied_cloud(6, 2, normals=True)
     state = GaussianSurfaceModel.from_cloud(cloud).state_dict()
@@ -67,21 +47,6 @@ def test_model_normals_take_the_side_of_the_file():
     assert not torch.equal(normals, axis)
     plain = GaussianSurfaceModel.from_cloud(varied_cloud(6, 2))
     assert torch.equal(plain.normals(), smallest_axis_normal(plain.quats, plain.scales))
-
-
-def test_model_methods_agree_with_the_functions(device, dtype):
-    cloud = varied_cloud(40, 2).to(device, dtype)
-    model = GaussianSurfaceModel.from_cloud(cloud)
-    directions = torch.randn(40, 3, device=device, dtype=dtype)
-    assert_close(model.covariance(), covariance(cloud.quats, cloud.scales))
-    assert_close(model.opacity(), 1 / (1 + (-cloud.opacities).exp()))
-    assert_close(model.colors(directions), sh_to_color(cloud.sh, directions))
-    assert_close(model.areas("paper"), patch_area(cloud.scales))
-    expected = coverage_area(cloud.means, model.normals(), cloud.scales, model.opacity())
-    assert_close(model.areas("coverage"), expected)
-    assert not torch.allclose(expected, patch_area(cloud.scales))
-    with value_error("Expected `mode` to be one of paper, coverage, open, but got 'disc'"):
-        model.areas("disc")
 
 
 def test_model_deforms_a_batch(device, dtype):

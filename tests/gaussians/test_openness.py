@@ -4,12 +4,12 @@ import math
 import bodies
 import pytest
 import torch
-from shared import EYE, alike, rand, seeded, unit
+from shared import EYE, alike, unit
 from torch.testing import assert_close
 
 from gaussian_swaying.gaussians.area import coverage_area
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
-from gaussian_swaying.gaussians.openness import LEAST, _split, openness
+from gaussian_swaying.gaussians.openness import LEAST, openness
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.scenes.ficus import ficus
 from gaussian_swaying.scenes.leaves import leafy_branch
@@ -183,18 +183,3 @@ def test_wild_input_stays_between_the_limits():
     assert torch.isfinite(weight).all()
     assert weight.min() >= LEAST
     assert weight.max() <= 1
-
-
-def test_depths_around_a_place_are_sums_over_its_own_column():
-    draw = seeded(0)
-    key = (5 * rand(60, generator=draw)).sort().values
-    at = (5 * rand(40, generator=draw)).sort().values
-    sheet, skin = rand(2, 40, generator=draw)
-    optical = rand(60, generator=draw)
-    passed = torch.nn.functional.pad(optical.cumsum(0), (1, 0))
-    found = _split(key, at, passed, sheet, skin)
-    away, own = key - at[:, None], key.floor() == at.floor()[:, None]
-    before, behind = away < -sheet[:, None], away >= sheet[:, None]
-    near = (away >= -skin[:, None]) & (away < skin[:, None])
-    for one, where in zip(found, (before, ~before & ~behind, behind, near), strict=True):
-        assert_close(one, (optical * (own & where)).sum(-1))

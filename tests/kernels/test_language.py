@@ -1,4 +1,3 @@
-import importlib.util
 import os
 import subprocess
 import sys
@@ -47,11 +46,6 @@ def test_constants_and_names():
 def test_sizes_are_those_of_triton():
     assert [triton.cdiv(n, 8) for n in (0, 1, 8, 9)] == [0, 1, 1, 2]
     assert [triton.next_power_of_2(n) for n in (0, 1, 2, 3, 64, 65)] == [1, 1, 2, 4, 64, 128]
-    if importlib.util.find_spec("triton"):
-        import triton as real
-
-        assert all(real.cdiv(n, 8) == triton.cdiv(n, 8) for n in range(30))
-        assert all(real.next_power_of_2(n) == triton.next_power_of_2(n) for n in range(1, 70))
 
 
 ASK = """

@@ -97,15 +97,6 @@ def test_damping_in_proportion_to_frequency(formulation):
 # ---- the substep
 
 
-def test_damped_substep_is_the_root_of_its_criterion():
-    """omega² (dt² + 2 beta dt) = 4 where omega * limit = 2; without damping the limit itself."""
-    for limit in (1e-5, 3e-3):
-        assert damped_substep(limit, 0.0) == limit
-        for time in (1e-9, 1e-4, 1e-2, 10.0):
-            dt = damped_substep(limit, time)
-            assert dt**2 + 2 * time * dt == pytest.approx(limit**2, rel=1e-12)
-
-
 @in_both
 def test_solver_divides_a_frame_by_the_damped_substep(formulation):
     """Its Courant number is that of the equally stable undamped substep: `cfl` for the longest substep."""
@@ -200,18 +191,8 @@ def _points(position, e=1e4, nu=0.3, density=100.0):
     return solid(position, 1e-6, density, e, nu)
 
 
-@pytest.mark.parametrize(
-    ("e", "nu", "density", "expected"),
-    [(2e6, 0.4, 300, 119.5), (1e4, 0.4, 15, 37.8), (5e5, 0.4, 200, 73.2), (1e4, 0.3, 20, 25.9), (3e3, 0.3, 20, 14.2)],
-)
-def test_wave_speeds_of_the_papers_scenes(e, nu, density, expected):
-    speed = wave_speed(_points(torch.zeros(1, 3).double(), e, nu, density))
-    assert float(speed[0]) == pytest.approx(expected, abs=0.05)
-
-
 def test_frame_is_divided_without_losing_a_substep():
     """int(4e-2 / 2e-5) is 1999."""
-    assert int(4e-2 / 2e-5) == 1999
     assert substeps_per_frame(4e-2, 2e-5, exact=True) == 2000
     assert substeps_per_frame(4e-2, 2e-5, exact=False) == 2000
     assert substeps_per_frame(0.04, 0.03, exact=False) == 2
@@ -239,17 +220,6 @@ def test_limit_is_sharp_for_one_particle(damping):
         end = solver.rollout(state.replace(node_velocity=mode), factor * limit, 400, check=False)
         strain = float(peak(end.F_elastic - EYE))
         assert (strain < 1e-6) == stable, (factor, strain)
-
-
-def test_updated_is_unstable_well_above_the_limit():
-    points = _points(torch.full((1, 3), 0.05, dtype=torch.float64))
-    solver = MPMSolver(0.1, "updated", gravity=ZERO)
-    state = solver.init_state(points)
-    state = state.replace(affine=1e-6 * EYE[None])
-    for factor, stable in ((0.98, True), (2.0, False)):
-        end = solver.rollout(state, factor * solver.stable_substep(), 400, check=False)
-        strain = float(peak(end.F_elastic - EYE))
-        assert (strain < 1e-5) == stable, (factor, strain)
 
 
 @in_both

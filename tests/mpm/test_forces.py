@@ -1,14 +1,11 @@
-"""Lists of forces: valid types, sums, work and gradients.
-
-``triton/test_forces.py`` tests the same for the fused substep.
-"""
+"""Lists of forces: valid types, sums, work and gradients; ``kernels/test_forces.py`` is for the fused substep."""
 
 import pytest
 import torch
-from shared import ZERO, beyond, double, in_both, longest, near, peak, rand, randn, seeded, solid, unit, value_error
+from shared import ZERO, double, in_both, longest, near, peak, rand, randn, seeded, solid, unit, value_error
 from torch.testing import assert_close
 
-from gaussian_swaying import AeroForce, Force, MPMSolver, PinnedRegion, SpatialWind, WindField, WindForce
+from gaussian_swaying import AeroForce, Force, MPMSolver, WindField, WindForce
 from gaussian_swaying.mpm.forces import FunctionForce, as_forces
 
 DT = 1e-3
@@ -101,13 +98,6 @@ def test_gradients_reach_a_force(checkpoint):
     assert float(found) == pytest.approx(float(ends[0] - ends[1]) / 2e-4, rel=1e-6)
 
 
-@torch.no_grad()
-def test_a_force_of_another_precision_changes_nothing_of_the_state():
-    solver, start, _ = _setting()
-    end = solver.rollout(start, DT, 2, lambda state: torch.ones(20, 3, dtype=torch.float32))
-    assert end.position.dtype == end.velocity.dtype == torch.float64
-
-
 def test_what_is_no_force_is_named():
     solver, start, wind = _setting()
     with pytest.raises(TypeError, match=r"`forces` to be Force objects or functions.*got Tensor.*`force`"):
@@ -138,67 +128,10 @@ def test_a_force_says_for_itself_whether_it_can_be_recorded():
 # ---- wind that depends on the place
 
 
-class Shear(SpatialWind):
-    """Stronger with height, and with time."""
-
-    recordable = True
-
-    def forward(self, time, position):
-        speed = (5.0 + 100.0 * time) * (1 + position[..., 2])
-        return torch.stack([speed, torch.zeros_like(speed), torch.zeros_like(speed)], dim=-1)
-
-
-class Everywhere(SpatialWind):
-    """The same everywhere, but given as a field."""
-
-    def forward(self, time, position):
-        return torch.tensor([4.0, 0.0, 1.0], dtype=position.dtype)
-
-
-@in_both
-@torch.no_grad()
-def test_a_wind_may_depend_on_the_place(formulation):
-    solver, start, wind = _setting(formulation)
-    same = WindForce(wind.aero, Everywhere(), wind.normal, wind.area)
-    near(solver.rollout(start, DT, 3, same).velocity, solver.rollout(start, DT, 3, wind).velocity, 1e-13)
-    shear = WindForce(wind.aero, Shear(), wind.normal, wind.area)
-    assert shear.device_function() is None
-    assert shear.recordable
-    assert not same.recordable
-    state = start
-    for _ in range(3):
-        force, _drag = wind.force(state, Shear()(state.time, state.position))
-        state = solver.step(state, DT, force=force)
-    end = solver.rollout(start, DT, 3, shear)
-    near(end.velocity, state.velocity, 1e-13)
-    assert peak(end.velocity - solver.rollout(start, DT, 3, wind).velocity) > 1e-4
-
-
-@torch.no_grad()
-def test_scenes_of_a_batch_may_mix_winds():
-    solver, start, wind = _setting(batch=(2,))
-    mixed = WindForce(wind.aero, [Shear(), WindField([1.0, 2.0, 3.0])], wind.normal, wind.area)
-    air = mixed.air(start.time, start.position)
-    assert_close(air[0], Shear()(start.time, start.position[0]))
-    assert air[1].unique(dim=0).tolist() == [[1.0, 2.0, 3.0]]
-    assert torch.isfinite(solver.rollout(start, DT, 2, mixed).position).all()
-
-
-@torch.no_grad()
-def test_samples_are_the_wind_at_several_times():
-    _, start, wind = _setting()
-    assert torch.equal(wind.samples(start, 0.1, 3), wind.winds(start.time, 0.1, 3))
-    shear = WindForce(wind.aero, Shear(), wind.normal, wind.area)
-    found = shear.samples(start, 0.1, 3)
-    for k in range(3):
-        assert_close(found[k], Shear()(start.time + 0.1 * k, start.position))
-
-
 # ---- drag at the end of the substep: unconditionally stable, and without effect if nothing moves
 
 
 AERO = AeroForce(C_D=1.2, C_F=0.0, C_L=0.0, drag_step="semi_implicit")
-ALONG = AeroForce(C_D=0.0, C_F=1.2, C_L=0.0, drag_step="semi_implicit")  # a sheet edge-on only stretches
 
 
 def _sheet(areal, e=1e4):
@@ -234,31 +167,3 @@ def test_one_step_is_the_implicit_one(formulation, dt):
     k = dt * 1.225 * 1.2 * 40.0 / (2 * 0.02)
     expected = (-10.0 + k * 30.0) / (1 + k)
     torch.testing.assert_close(state.velocity[:, 1], torch.full_like(points.mass, expected))
-
-
-@in_both
-def test_a_free_sheet_never_overtakes_the_wind(formulation):
-    """A jump from calm to 100 m/s, with a substep that shrinks at the same moment."""
-    points = _sheet(0.02)
-    solver = MPMSolver(0.1, formulation, gravity=ZERO)
-    state, _ = _run(solver, solver.init_state(points), [0.0, 0.0, 0.0], 4e-4, 3)
-    state, fastest = _run(solver, state, [0.0, 100.0, 0.0], 1e-4, 60)
-    assert fastest <= 100.0 * (1 + 1e-9)
-    assert state.velocity[:, 1].mean() > 90.0
-
-
-@pytest.mark.slow(gate=["total"])
-@in_both
-def test_what_hangs_still_feels_all_of_its_weight_and_wind(formulation):
-    """In equilibrium nothing moves, so the drag equals the explicit one for any substep: the same sag, with weight."""
-    places = []
-    for dt in (2e-4, 6e-4):
-        points = _sheet(0.02, e=3e4)
-        pin = PinnedRegion(beyond(z=0.35))
-        solver = MPMSolver(0.1, formulation, damping=30.0, boundaries=[pin])
-        state, _ = _run(solver, solver.init_state(points), [0.0, 0.0, -15.0], dt, round(0.24 / dt), ALONG)
-        assert peak(state.velocity) < 1e-3
-        places.append(state.position - points.position)
-    sag = float(peak(places[0]))
-    assert sag > 2e-4
-    near(places[1], places[0], 0.01 * sag)

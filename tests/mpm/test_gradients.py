@@ -116,37 +116,26 @@ def test_gradient_with_damping_and_two_laws(name, setting):
     _check(name, [FixedCorotated(), NeoHookean()], damping=2.0, stiffness_damping=2e-3, **SETTINGS[setting])
 
 
-@pytest.mark.parametrize("case", ["at rest", "inverted", "crushed", "light node"])
+@pytest.mark.parametrize("case", ["at rest", "light node"])
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("setting", SETTINGS)
 def test_gradients_are_finite(setting, law, case):
-    """F = I exactly, no motion, no wind, no weight; the patch turned inside out along x, or pressed nearly flat; and a
-    node whose mass is so small that the square of its inverse overflows in float32.
+    """F = I exactly, no motion, no wind, no weight; and a node whose mass is so small that the square of its inverse
+    overflows in float32.
     """
-    still, light = case == "at rest", case == "light node"
+    still = case == "at rest"
     values = {name: 0 * value if still and name in ("velocity", "wind") else value for name, value in _values().items()}
-    if light:
+    if not still:
         values = {name: value.float() for name, value in values.items()}
         values["position"] = values["position"].clone()
         values["position"][0] = torch.tensor([0.075] * 3) - 1e-3 * DX  # its farthest node has half the cube of 1e-6
     values = {name: value.clone().requires_grad_() for name, value in values.items()}
     gravity = (0.0, 0.0, 0.0) if still else (0.0, 0.0, -9.8)
     solver, state, force = _start(values, LAWS[law](), gravity=gravity, **SETTINGS[setting])
-    if light:
+    if not still:
         stencil = bspline_stencil(values["position"].detach(), state.grid)
         mass = scatter(stencil, solver.points.mass.detach()[:, None, None])[:, 0]
         assert 1e-32 < mass[mass > 0].min() < 5e-20
-    elif not still:
-        stretch = torch.diag(double([-0.7 if case == "inverted" else 1e-3, 1.1, 0.9]))
-        if setting == "total":
-            nodes = state.grid.node_positions(REST)
-            moved = nodes @ stretch - nodes + state.node_displacement
-            state = solver.bound.read_particles(state, moved, state.node_velocity)
-        else:
-            F = stretch @ state.F_elastic
-            state = state.replace(F_elastic=F, F_total=F)
-        det = torch.linalg.det(state.F_elastic)
-        assert bool((det < 0).all() if case == "inverted" else (det < 2e-3).all())
     state = solver.rollout(state, 1e-3, STEPS, force)
     loss = state.position.square().sum() + state.F_total.square().sum()
     for name, gradient in zip(values, torch.autograd.grad(loss, list(values.values())), strict=True):

@@ -246,13 +246,3 @@ def test_on_a_gpu_a_rollout_is_checked_and_a_step_does_not_wait(formulation):
         state = solver.step(state, DT, force=bad)
     with value_error("is NaN or infinite"):
         solver.rollout(state, DT, 2)
-
-
-@pytest.mark.parametrize("value", [0, 1.0, True, "2", None])
-def test_a_whole_number_that_is_none_or_too_small(value):
-    with value_error("`downscale` to be a whole number of at least 1, but got"):
-        _checks.check_whole("downscale", value, 1)
-
-
-def test_a_whole_number_may_be_the_least_one():
-    assert _checks.check_whole("test_every", 0, 0) is None

@@ -2,7 +2,7 @@ import math
 
 import pytest
 import torch
-from shared import ZERO, alike, double, longest, near, peak, randn, seeded, solid, up_to, value_error
+from shared import ZERO, double, longest, near, randn, seeded, solid, up_to, value_error
 from small_scenes import plain_cloud
 from torch.testing import assert_close
 
@@ -10,7 +10,6 @@ from gaussian_swaying import (
     AeroForce,
     Force,
     Material,
-    MaterialPoints,
     MPMSolver,
     PinnedRegion,
     WindField,
@@ -93,18 +92,6 @@ def test_it_leans_as_total_does(speed, lean, error):
 # ---- energy and damping
 
 
-def test_energy_is_constant_in_still_air():
-    """Each mode is stepped exactly, so what is left is rounding: some 1e-16 for each of 1500 substeps."""
-    points, solver = post(), solver_of()
-    state = pulled(solver, points, 1.0)
-    first = energy(solver, state)
-    assert float(first) > 0
-    for _ in range(10):
-        state = run(solver, state, frames=10)
-        alike(energy(solver, state), first, 1e-12)
-    assert float(state.work) == 0
-
-
 def test_the_work_of_a_force_is_the_gain_of_energy():
     class Push(Force):
         def forward(self, state):
@@ -145,7 +132,8 @@ def free_decay(solver, points):
 
 
 @pytest.mark.parametrize(
-    ("ratio", "rate", "stiff"), [(0.03, 0.0, 0.0), (0.0, 0.4, 0.0), (0.0, 0.0, 2e-3), (0.03, 0.4, 2e-3)]
+    ("ratio", "rate", "stiff"),
+    [(0.0, 0.0, 0.0), (0.03, 0.0, 0.0), (0.0, 0.4, 0.0), (0.0, 0.0, 2e-3), (0.03, 0.4, 2e-3)],
 )
 def test_a_free_decay_has_the_ratio_of_the_material_and_of_the_solver(ratio, rate, stiff):
     """The closed form q = e^(-zeta w t) (cos(w_d t) + zeta w / w_d sin(w_d t)), to rounding."""
@@ -196,20 +184,6 @@ def test_a_rigid_turn_is_exact():
 # ---- batches and gradients
 
 
-def test_a_batch_is_its_scenes():
-    points = [post(E=1e5), post(E=3e5, density=150.0)]
-    one = wind(6.0)
-    twice = WindForce(one.aero, one.wind, one.normal.expand(2, POINTS, 3), one.area.expand(2, POINTS))
-    solver = solver_of()
-    together = solver.init_state(MaterialPoints.stack(points))
-    together = solver.rollout(together, 0.01, 40, twice)
-    for k in range(2):
-        alone = solver_of()
-        state = alone.rollout(alone.init_state(points[k]), 0.01, 40, wind(6.0))
-        assert_close(together.position[k], state.position, rtol=1e-9, atol=1e-12)
-        assert_close(together.work[k], state.work, rtol=1e-9, atol=1e-12)
-
-
 @pytest.mark.parametrize("name", ["flow", "E", "C_D", "density"])
 def test_gradients_are_those_of_differences(name):
     """Of the place of the top after half a second; the shapes of the modes do not change with a factor of E or mass."""
@@ -244,33 +218,12 @@ def swaying(make_simulation, formulation="modes", **more):
     return make_simulation(cloud, scene=scene, formulation=formulation, gravity=ZERO, dx=0.1, **more)
 
 
-def test_a_run_that_goes_on_is_the_same_to_the_bit(make_simulation, tmp_path):
-    def made():
-        return swaying(make_simulation)
-
-    whole = [frame.state for frame in made().frames(7)]
-    simulation = made()
-    state = simulation.start()
-    for _ in range(3):
-        state, _ = simulation.advance(state)
-    kept = {name: getattr(state, name) for name in state.__dataclass_fields__}
-    torch.save({name: value for name, value in kept.items() if isinstance(value, torch.Tensor)}, tmp_path / "s.pt")
-    saved = torch.load(tmp_path / "s.pt")
-    assert "modal" in saved
-    again = made()
-    state = again.start().replace(**saved)
-    for _ in range(3):
-        state, _ = again.advance(state)
-    assert torch.equal(state.modal, whole[6].modal)
-    assert torch.equal(state.position, whole[6].position)
-
-
 def test_a_change_keeps_the_motion_continuous(make_simulation):
     simulation = swaying(make_simulation)
     state = simulation.start()
     for _ in range(10):
         state, _ = simulation.advance(state)
-    for values in ({"material.E": 9e3}, {"solver.damping": 3.0}, {"wind.speed": 1.0}):
+    for values in ({"material.E": 9e3}, {"solver.damping": 3.0}, {"material.density": 60.0}, {"wind.speed": 1.0}):
         before = state
         simulation.change(values)
         q, p = simulation.solver.bound.amplitudes(state)
@@ -310,10 +263,8 @@ def test_a_frame_has_from_four_to_sixteen_substeps():
         assert solver.bound.stable_substep(state) == math.inf
 
 
-def test_any_force_acts():
+def test_a_force_may_resist():
     points, solver = post(E=1e5), solver_of()
-    state = solver.rollout(solver.init_state(points), 0.01, 30, lambda s: torch.full_like(s.position, 0.01))
-    assert (state.position - points.position)[-1, :2].gt(0.001).all()
 
     def brake(now):
         return -0.5 * now.velocity, torch.full_like(now.position[..., 0], 0.5)
@@ -344,17 +295,6 @@ def test_what_modes_cannot_do_is_refused(points, pins, words):
     assert words in str(error.value)
     with value_error("`pivot`"):
         solver_of("total", pivot=True)
-
-
-def test_another_density_keeps_the_place():
-    """The state has the amplitudes of 1 kg, so that a live change of the mass does not make the motion jump."""
-    first, second = solver_of(), solver_of()
-    state = run(first, first.init_state(post()), wind(points=POINTS), frames=10)
-    second.init_state(post(density=200.0))
-    moved = second.bound.shown(state, *second.bound.amplitudes(state))
-    assert peak(state.position - post().position) > 1e-3
-    assert torch.allclose(moved.position, state.position, rtol=0, atol=1e-12)
-    assert torch.allclose(moved.velocity, state.velocity, rtol=0, atol=1e-12)
 
 
 def test_on_a_pivot_it_sways_as_easily_along_as_across():

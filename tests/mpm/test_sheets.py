@@ -3,7 +3,7 @@ import dataclasses
 import pytest
 import torch
 from catalogue import ELASTIC
-from shared import EYE, ZERO, double, peak, randn, seeded, solid, unit, value_error
+from shared import EYE, double, peak, randn, seeded, solid, unit, value_error
 from torch.testing import assert_close
 
 from gaussian_swaying import MaterialPoints, MPMSolver
@@ -123,14 +123,6 @@ def test_sheets_in_one_cell_bend_each_for_itself():
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_few_rows_make_the_matrix_of_a_cell(seed):
-    bending = bound(sheet(turned(seed)))[0].bound.bending
-    rows = bending.rows()
-    assert_close(rows.mT @ rows, bending.stiffness, rtol=1e-9, atol=1e-12)
-    assert rows.shape[1] <= 27
-
-
-@pytest.mark.parametrize("seed", [0, 1])
 def test_the_largest_frequency_is_found_and_bounds_the_substep(seed):
     points = sheet(turned(seed), size=3, bending=40.0)
     solver, state = bound(points)
@@ -148,27 +140,6 @@ def test_the_largest_frequency_is_found_and_bounds_the_substep(seed):
     start = solver.init_state(points, noise)
     calm = solver.rollout(start, 0.99 * solver.stable_substep(start), 400)
     assert peak(calm.velocity) < 2 * peak(noise)
-
-
-def test_gradients_by_stiffness_and_motion_come_from_torch():
-    points = sheet(turned(1), size=3)
-    solver = MPMSolver(1.0, gravity=ZERO)
-    leaves = [double(value).requires_grad_() for value in (100.0, 0.0, 1.0)]
-
-    def final(E, push, factor):
-        E = E * torch.ones_like(points.youngs_modulus)
-        own = dataclasses.replace(points, youngs_modulus=E, bending=points.bending * factor)
-        start = solver.init_state(own, 0.3 * points.position[..., [1, 2, 0]].sin() + push)
-        return solver.rollout(start, 0.02, 12).position.square().sum()
-
-    found = torch.autograd.grad(final(*leaves), leaves)
-    with torch.no_grad():
-        for k in range(3):
-            step = [1e-4 * (j == k) for j in range(3)]
-            high, low = (
-                final(*(leaf + sign * h for leaf, h in zip(leaves, step, strict=True))) for sign in (1.0, -1.0)
-            )
-            assert float(found[k]) == pytest.approx(float(high - low) / 2e-4, rel=1e-5)
 
 
 @pytest.mark.parametrize("name", ELASTIC)
@@ -212,21 +183,6 @@ def test_the_state_has_the_normal_of_the_sheet():
         along = F @ (EYE - points.normal[..., :, None] * points.normal[..., None, :])
         assert peak(out[..., None, :] @ along) < 1e-12
         assert peak(F - EYE) > 0.05
-
-
-def test_energy_is_kept_while_a_sheet_shakes():
-    points = sheet(turned(1), size=4, bending=20.0)
-    solver, _ = bound(points)
-    state = solver.init_state(points, 0.2 * points.position[..., [1, 2, 0]].sin())
-    dt, found, bent = 0.1 * solver.stable_substep(state), [], 0.0
-    for _ in range(60):
-        state = solver.rollout(state, dt, 10)
-        energies = solver.energies(state)
-        found.append(float(energies["kinetic"] + energies["elastic"]))
-        bent = max(bent, float(solver.bound.bending.energy(state.node_displacement)) / found[-1])
-    assert bent > 0.03
-    # velocities are half a substep behind: kinetic energy is off by omega dt / 2 < 0.1 of what is exchanged
-    assert max(found) - min(found) < 0.1 * found[0]
 
 
 def test_wrong_numbers_are_refused():

@@ -22,9 +22,6 @@ from gaussian_swaying.mpm.colliders import Obstacle, VelocityBox, Wall
 from gaussian_swaying.mpm.contact import Surface
 from gaussian_swaying.mpm.embedded import EmbeddedInGrid, on_material
 from gaussian_swaying.mpm.pins import RigidRegion
-from gaussian_swaying.mpm.state import GridSpec
-from gaussian_swaying.mpm.transfer import shifts
-from gaussian_swaying.mpm.virtual_nodes import coordinates, first_nodes, point_with_nodes, virtual_nodes
 from gaussian_swaying.wind.effects import Profile
 
 EDGE = up_to(x=1.0)
@@ -91,18 +88,6 @@ def test_two_sheets_each_move_as_alone(transfer, kind):
         assert longest(both.position[number == k] - alone) < 1e-9 * far
         assert longest(glued.position[number == k] - alone) > 0.1 * far
     assert abs(energy) < 1e-9
-
-
-def test_a_place_takes_the_nodes_of_a_point_of_its_cell_that_is_near():
-    grid = GridSpec(1.0, (0, 0, 0), (12, 4, 4))
-    x = double([1.2, 2.2, 9.2])
-    first = first_nodes(torch.stack([x, 0 * x + 1.2, 0 * x + 1.2], -1), grid)
-    nodes = (first[:, None] + shifts(grid)).T.contiguous()
-    place, near = first[[0, 1, 1, 1]], torch.tensor([0, 1, 0, 2])
-    assert point_with_nodes(place, near, first, nodes, grid).tolist() == [0, 1, 1, -1]
-    copied = nodes.clone()
-    copied[:, 1] += 1000
-    assert point_with_nodes(place, near, first, copied, grid).tolist() == [0, 1, -1, -1]
 
 
 def strip(x, y, z):
@@ -277,16 +262,6 @@ def test_a_state_is_saved_and_read():
     assert solver.continued(solver, state, start) is not None
 
 
-def test_gradients_come_from_torch():
-    position, number = together(sheet(3.1, 1, 2), sheet(3.3, 1, 2))
-    points = material(position, number)
-    modulus = points.youngs_modulus.clone().requires_grad_()
-    solver = MPMSolver(1.0, boundaries=[PinnedRegion(EDGE)])
-    state = solver.init_state(dataclasses.replace(points, youngs_modulus=modulus))
-    solver.rollout(state, 1e-2, 5).position.sum().backward()
-    assert modulus.grad.abs().amax() > 0
-
-
 def test_close_parts_touch_and_do_not_pass_each_other():
     """Sheets with a gap of 0.4 cells that are pushed together; on shared nodes they would be one body."""
     position, number = together(sheet(3.1), sheet(3.5))
@@ -323,19 +298,6 @@ def test_contact_and_obstacles_in_kernels():
     low, high = (end.position[number == k, 2] for k in (0, 1))
     assert (high - low).min() > 0.1  # across tilted sheets; one that has passed the other has less than 0
     assert ((end.position - torch.tensor([2.0, 2.0, 2.3]).double()).norm(dim=-1) > 0.7).all()
-
-
-def test_copies_are_numbered_after_the_lattice():
-    grid = GridSpec(1.0, (0, 0, 0), (4, 3, 3))
-    first = torch.tensor([0, 0, 9])
-    found = virtual_nodes(first, grid, torch.tensor([[0, 2]]))
-    assert found.original.shape == (1, 27)
-    assert torch.equal(found.node[:, 1], 36 + torch.arange(27))  # the second point is alone
-    assert torch.equal(found.original[0], torch.arange(27))
-    assert torch.equal(found.node[:18, 2], found.node[9:, 0])  # the others share what both reach
-    assert found.node[:, [0, 2]].max() < 36
-    assert virtual_nodes(first, grid, torch.tensor([[0, 2], [0, 1]])) is None
-    assert coordinates(torch.tensor(35), grid).tolist() == [3, 2, 2]
 
 
 def test_wrong_numbers_are_refused():

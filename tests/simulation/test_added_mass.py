@@ -41,19 +41,6 @@ def test_still_air_slows_a_hanging_sheet(formulation, hanging):
     near(slow, fast, 1e-9)
 
 
-def test_its_frequency_is_that_of_the_plate_with_its_air(hanging):
-    """From the time of the first turn of the swing, with the same frames; 2 %."""
-
-    def turn(aero):
-        frames = hanging(aero, frame_dt=0.02).frames(91)
-        swing = torch.stack([frame.state.position[:, 1].mean() for frame in frames])
-        k = int((swing[1:-1] > torch.maximum(swing[:-2], swing[2:])).nonzero()[0]) + 1
-        before, at, after = swing[k - 1 : k + 2].tolist()
-        return 0.02 * (k + 0.5 * (before - after) / (before - 2 * at + after))
-
-    assert turn(air(0.0)) / turn(air()) == pytest.approx(SLOWER, rel=0.02)
-
-
 @pytest.mark.parametrize("transfer", ["torch", "kernels"])
 @in_both
 def test_a_sheet_falls_slower_as_it_has_to_move_air(formulation, transfer, make_simulation):
@@ -89,20 +76,6 @@ def test_the_air_that_is_lifted_is_no_work_of_the_wind(hanging):
         worst.append(max(abs(sum(health.wind_work for health in log[:k])) for k in range(1, 26)))
         assert worst[-1] < 0.1 * max(health.kinetic for health in log)
     assert worst[1] < 0.6 * worst[0]
-
-
-@in_both
-def test_kernels_and_torch_agree(formulation, hanging):
-    """In float64, with wind and gravity."""
-    ends = []
-    for transfer in ("torch", "kernels"):
-        wind = WindField([1.0, 5.0, 0.0])
-        simulation = hanging(air(drag=0.5), wind=wind, transfer=transfer, formulation=formulation)
-        state, log = advanced(simulation, 5)
-        ends.append((state.position, log[-1]))
-    near(ends[0][0], ends[1][0], 1e-10)
-    for name in ("kinetic", "potential", "wind_work"):
-        assert getattr(ends[0][1], name) == pytest.approx(getattr(ends[1][1], name), rel=1e-7)
 
 
 def test_a_batch_is_as_each_alone(hanging):

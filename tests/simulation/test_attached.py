@@ -9,7 +9,7 @@ from gaussian_swaying.gaussians.parts import Part, Parts
 from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes import FlagScene, GivenScene
-from gaussian_swaying.simulation.body import Material, Scene, attached_points, homes, lies_apart, pieces_in_cells
+from gaussian_swaying.simulation.body import Material, Scene, homes, pieces_in_cells
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.suggestion.suggest import why_apart
 
@@ -74,22 +74,6 @@ def test_parts_correct_what_was_found():
     assert apart.start().grid.virtual > 2 * glued.start().grid.virtual
 
 
-def test_points_of_a_group_are_attached_to_each_other():
-    pairs = attached_points(
-        torch.tensor([[0, 1], [2, 3]]), torch.tensor([0, 0, 2, 4]), torch.tensor([0, 0, 1, 1, 1]), 1
-    )
-    assert sorted(map(tuple, pairs.tolist())) == [(0, 1), (2, 3), (2, 4), (3, 4)]
-    pairs = attached_points(torch.tensor([[0, 1]]), torch.tensor([0, 1]), None, 3)
-    assert {(0, 1), (2, 3), (4, 5), (0, 2), (0, 4), (2, 4)} <= set(map(tuple, pairs.tolist()))
-
-
-def test_pieces_of_a_cell_are_those_attached_within_it():
-    place = torch.tensor([[0.6, 1.0, 1.0], [1.4, 1.0, 1.0], [1.6, 1.0, 1.0], [0.7, 1.0, 1.0]])
-    found = pieces_in_cells(place, 1.0, torch.tensor([[0, 2], [2, 1], [0, 3]]))
-    assert found[0] == found[3]
-    assert len(found.unique()) == 3
-
-
 def test_a_few_samples_beyond_a_border_are_grouped_across_it():
     """Cells end at halves: of 24 samples in a row along x, two lie beyond 1.5, and one on another piece."""
     row = torch.stack([torch.linspace(0.6, 1.54, 24), torch.ones(24), torch.ones(24)], 1).double()
@@ -102,12 +86,6 @@ def test_a_few_samples_beyond_a_border_are_grouped_across_it():
     assert home[beyond[0], 0] < 1.5
     assert torch.equal(home[: beyond[0]], place[: beyond[0]])
     assert torch.equal(home[24], place[24])
-
-
-def test_what_is_connected_within_each_node_lies_nowhere_apart():
-    place = torch.tensor([[1.0, 1.0, 1.0], [1.3, 1.0, 1.0], [2.0, 1.0, 1.0], [9.0, 1.0, 1.0]])
-    assert not lies_apart(place, 1.0, torch.tensor([[0, 1], [1, 2]]))  # the last one is far away
-    assert lies_apart(place, 1.0, torch.tensor([[0, 1]]))
 
 
 def test_it_needs_the_total_formulation():

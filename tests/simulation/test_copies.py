@@ -25,24 +25,12 @@ from gaussian_swaying.scenes import FlagScene, GivenScene
 from gaussian_swaying.simulation.body import Material, Scene
 from gaussian_swaying.simulation.model import Copy, Edit
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.wind.field import FlowKey, GaussianGust, SpatialWind, UniformGust, WindField
+from gaussian_swaying.wind.field import GaussianGust, UniformGust, WindField
 from gaussian_swaying.wind.tables import Shelter
 
 POLE = up_to(x=0.11)
 AXIS = FlagScene(spacing=0.1).generate().means[0]  # the middle of the particles that POLE holds; only x and y count
 ROW = [Copy(), Copy([0.0, 1.5, 0.0], 90.0), Copy([0.5, 3.0, 0.2], 200.0, delay=0.1)]
-
-
-class Whirl(SpatialWind):
-    """Air that turns about a vertical axis through a place, faster farther away."""
-
-    def __init__(self, center=(0.0, 0.0)):
-        super().__init__()
-        self.center = center
-
-    def forward(self, time, position):
-        x, y = position[..., 0] - self.center[0], position[..., 1] - self.center[1]
-        return torch.stack([2.0 - y, 3.0 + x, 0.3 * torch.ones_like(x)], dim=-1)
 
 
 class Push(Force):
@@ -136,26 +124,6 @@ def test_a_turned_copy_in_a_turned_wind_moves_alike(degrees):
     near(b.means[10:], moved, 1e-5)
     near(b.covariances[10:], A @ a.covariances[10:] @ A.T, 1e-6)
     near(b.normals[10:], a.normals[10:] @ A.T, 1e-5)
-
-
-def test_a_wind_that_varies_in_space_is_that_at_the_place():
-    """A copy 2 m away in a whirl moves as the object in a whirl that is 2 m away on the other side."""
-    fixed = {"solver": {"substep": 0.002}, "dtype": "float64"}
-    copies = _end(_simulation([Copy(), Copy([2.0, 0.0, 0.0])], Whirl(), **fixed)).state
-    alone = [_end(_simulation([], Whirl((-x, 0.0)), **fixed)).state for x in (0.0, 2.0)]
-    for k in (0, 1):
-        near(copies.position[k], alone[k].position, 1e-12)
-    assert peak(alone[0].position - alone[1].position) > 0.01
-
-
-def test_a_delay_is_the_same_wind_later():
-    """A moment of the schedule lies within a substep, so that rounding of times does not decide about one."""
-    keys = [FlowKey(0.0, [0.0, 0.0, 0.0]), FlowKey(0.041, [6.0, 1.5, 0.0], gusts=0.5), FlowKey(0.121, gusts=1.0)]
-    wind = WindField(schedule=keys, modulations=[UniformGust(0.5)], seed=2)
-    frames = list(_simulation([Copy(), Copy(delay=0.08)], wind, solver={"substep": 0.002}, dtype="float64").frames(7))
-    late = frames[6].state.position[1]
-    near(late, frames[4].state.position[0], 1e-9)
-    assert peak(late - frames[6].state.position[0]) > 0.01
 
 
 def test_each_has_gusts_of_its_own():

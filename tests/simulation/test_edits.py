@@ -14,7 +14,6 @@ from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.simulation.body import Material, MaterialRegion
 from gaussian_swaying.simulation.model import Edit, edited_points, recolored
 from gaussian_swaying.wind.field import WindField
-from gaussian_swaying.wind.force import AeroForce
 
 FREE_HALF = [0.55, None, None], [None, None, None]
 WHITE = [0.95, 0.95, 0.95]
@@ -201,44 +200,6 @@ def test_what_has_flowed_and_turns_elastic_keeps_its_shape(make_cloud, make_simu
     # the factor of flow that is kept: F_total = F_elastic F_plastic
     kept = torch.linalg.solve(end.F_elastic, end.F_total)
     near(kept, torch.linalg.solve(flowed.F_elastic, flowed.F_total), 1e-4)
-
-
-@in_both
-def test_the_kernels_take_an_edit(formulation, make_cloud, make_simulation):
-    """The Triton substep before and after, also where a law that flowed turns elastic, against the one in torch."""
-    if formulation == "updated":
-        material, law = Material(E=1e5, density=1000.0, thickness=0.2, law=Plasticine(1.0, 0.0, 1.0)), NeoHookean()
-    else:
-        material, law = Material(E=1e4, density=1000.0, thickness=0.2), None
-    shear = torch.tensor([[0.0, 0.0, 0.0], [20.0, 0.0, 0.0], [0.0, 0.0, 0.0]])  # 1/s
-    ends = []
-    for transfer in ("torch", "kernels"):
-        simulation = make_simulation(
-            make_cloud(24, degree=0),
-            material=material,
-            pinned=False,
-            formulation=formulation,
-            transfer=transfer,
-            aero=AeroForce(air_density=0.0),
-            frame_dt=0.008,
-            dx=0.4,
-        )
-        simulation.start()
-        state = simulation.solver.init_state(
-            simulation.scene.points, simulation.scene.points.position @ shear.T, frame=simulation.scene.frame
-        )
-        for edit in (Edit(E=3e5, law=law), Edit(beyond(x=0.5), E=2e5, law=law)):
-            state, _ = simulation.advance(state)
-            state = simulation.edit(state, edit)
-        state, _ = simulation.advance(state)
-        assert (simulation.solver.kernels is not None) == (transfer == "kernels")
-        ends.append(state)
-    for name in ("position", "velocity", "F_elastic", "F_total"):
-        one, two = (getattr(end, name) for end in ends)
-        # some ten substeps of at most 2e-5 of the largest value each
-        near(two, one, 2e-4 * float(peak(one)))
-    gap = float(peak(ends[0].F_total - ends[0].F_elastic))
-    assert gap > 0.02 if formulation == "updated" else gap == 0
 
 
 def test_what_cannot_be_is_refused_before_anything_is_written(make_simulation, tmp_path):

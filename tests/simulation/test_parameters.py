@@ -5,12 +5,9 @@ import sys
 import pytest
 import torch
 import yaml
-from shared import beyond, double, peak, up_to, value_error
+from shared import beyond, double, up_to, value_error
 from small_films import base
 
-from gaussian_swaying.inverse.plan import Unknown, check_unknowns, read_plan
-from gaussian_swaying.inverse.report import scene_text
-from gaussian_swaying.inverse.variants import states_of
 from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.player.session import Session, changed_settings
@@ -223,37 +220,6 @@ def test_a_number_of_a_users_force_is_live_without_a_parse(breath, parser, monke
     _close(session.simulation.model.value("material.E"), 1e4)
     with value_error("from 0 to 9"):
         changed_settings(parser, settings, {"forces.Breath.strength": 10.0})
-
-
-def test_a_number_of_a_users_force_is_sought(breath, parser, tmp_path):
-    (tmp_path / "fit.yaml").write_text(
-        yaml.safe_dump({"base": str(breath), "videos": ["v"], "unknowns": {"forces.Breath.strength": [0.1, 5.0]}})
-    )
-    plan = read_plan(tmp_path / "fit.yaml")
-    assert plan.unknowns[0].unit == "N"
-    settings = parser.parse_args(["--config", str(breath), "--device=cpu"])
-    simulation = Simulation.from_settings(parser, settings)
-    check_unknowns(simulation, plan.unknowns)
-    values = [{"forces.Breath.strength": 0.0}, {"forces.Breath.strength": 5.0}, {"wind.speed": 5.0}]
-    weak, strong, same = [state.position for state in list(states_of(simulation, values, [0.0, 0.08]))[-1]]
-    assert (strong - weak)[:, 2].mean() > 1e-3
-    assert peak(same - weak) > 0  # 0.1 by default
-    text = scene_text({"forces.Breath.strength": 2.5}, parser, settings, simulation)
-    assert yaml.safe_load(text)["forces"][0]["init_args"]["strength"] == 2.5
-    with value_error("range"):
-        Unknown("forces.Breath.strength", -1.0, 5.0)
-
-
-def test_a_number_of_a_users_force_is_swept(breath, parser, tmp_path):
-    axes = {"forces.Breath.strength": [0.2, 0.4], "wind.seed": [1, 2]}
-    (tmp_path / "sweep.yaml").write_text(json.dumps({"base": str(breath), "axes": axes}))
-    plan = read_sweep(tmp_path / "sweep.yaml", parser=parser)
-    found = [parse_run(parser, plan.config, 2, run).forces[0].init_args.strength for run in plan.runs]
-    assert sorted(found) == [0.2, 0.2, 0.4, 0.4]
-    assert len(grouped(plan.runs, 8)) == 2  # runs that differ in the seed go together
-    (tmp_path / "sweep.yaml").write_text(json.dumps({"base": str(breath), "axes": {"forces.Breath.strength": [99.0]}}))
-    with value_error("from 0 to 9"):
-        read_sweep(tmp_path / "sweep.yaml", parser=parser)
 
 
 @pytest.mark.parametrize("backwards", [False, True])

@@ -5,16 +5,16 @@ import math
 
 import pytest
 import torch
-from shared import advanced, beyond, peak, rand, randn, seeded, unit, up_to, value_error
+from shared import advanced, beyond, peak, rand, randn, seeded, up_to, value_error
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.filling import InteriorFilling
-from gaussian_swaying.geometry.patches import deform_all, deform_patch
+from gaussian_swaying.geometry.patches import deform_all
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.kernels.language import INTERPRETED
 from gaussian_swaying.mpm.laws.elastic import NeoHookean
 from gaussian_swaying.mpm.solver import MPMSolver
-from gaussian_swaying.scenes import DemoScene, FlagScene, GivenScene
+from gaussian_swaying.scenes import FlagScene, GivenScene
 from gaussian_swaying.scenes.solid import SolidScene
 from gaussian_swaying.simulation.body import Material, MaterialRegion, Scene, SimulatedScene, matched_points
 from gaussian_swaying.simulation.measure import measure
@@ -82,16 +82,6 @@ def test_points_of_a_group_have_its_moments(sizes, count):
         assert count == 1 or float(near.double().mean()) > 0.9
     single, _, _ = matched_points(place, mass, group, torch.full((5,), False), 1.0)
     assert len(single) == 5
-
-
-def test_points_of_a_full_cell_are_those_of_gauss():
-    axis = (torch.arange(40).double() + 0.5) / 40
-    place = torch.cartesian_prod(axis, axis, axis[:1])
-    points, _, _ = matched_points(
-        place, torch.ones(1600), torch.zeros(1600, dtype=torch.long), torch.tensor([True]), 1.0
-    )
-    found = (points[:, :2] - 0.5).abs()
-    torch.testing.assert_close(found, torch.full((4, 2), 0.5 / 3**0.5).double(), rtol=1e-3, atol=0)
 
 
 def test_groups_do_not_cross_borders(make_scene):
@@ -316,28 +306,3 @@ def test_recorded_measurements_are_those_of_the_frame(make_simulation):
             assert found.as_dict() == pytest.approx(expected.as_dict(), rel=1e-6)
             state = end
     assert any(simulation.stepper._gauge.replayed._repeater._graphs.values())
-
-
-@pytest.mark.parametrize("law", ["paper", "projected"])
-@pytest.mark.parametrize("scene", ["flag", "leaves", "noise"])
-def test_wind_on_the_groups_of_a_scene_is_that_on_its_patches(law, scene, make_cloud, make_scene):
-    """Within 1 % of the sum over the patches, in any direction, for moving and turned groups."""
-    cloud = {"flag": fine_flag, "leaves": DemoScene("leaves", 0.01).generate, "noise": lambda: make_cloud(4000)}[
-        scene
-    ]()
-    dx = 0.3 if scene == "noise" else 0.1
-    scene = make_scene(cloud, dx=dx, points="grid", dtype=torch.float64)
-    patches = scene.patches
-    generator = seeded(0)
-    turn = torch.linalg.qr(randn(scene.points.count, 3, 3, generator=generator))[0]
-    turn = turn * torch.linalg.det(turn)[:, None, None]
-    velocity = randn(scene.points.count, 3, generator=generator)
-    aero = AeroForce(law=law)
-    force = WindForce(aero, WindField([0.0, 0.0, 0.0]), patches)
-    state = MPMSolver(dx).init_state(scene.points).replace(F_total=turn, velocity=velocity)
-    normal, area = deform_patch(turn[patches.point], patches.normal, patches.area)
-    for wind in unit(10, 3, generator=generator):
-        each = aero(6 * wind, velocity[patches.point], normal, area)
-        expected = torch.zeros_like(velocity).index_add(0, patches.point, each)
-        found = force.force(state, 6 * wind)[0]
-        assert (found - expected).norm(dim=-1).sum() < 0.01 * expected.norm(dim=-1).sum()

@@ -2,7 +2,7 @@ import dataclasses
 
 import pytest
 import torch
-from shared import double, up_to
+from shared import double
 
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.simulation.body import Samples, grouped
@@ -25,12 +25,6 @@ def _pairs():
         surface=torch.ones(8, dtype=torch.bool),
         **each,
     )
-
-
-def test_like_samples_of_a_cell_are_one_group():
-    points, owner, _ = grouped(_pairs(), 1.0, 1, [], FRAME, DOUBLE)
-    assert owner.tolist() == [0] * 8
-    assert points.mass.tolist() == [8.0]
 
 
 @pytest.mark.parametrize(
@@ -64,13 +58,3 @@ def test_areas_that_differ_share_a_group_if_all_feel_the_wind():
     points, owner, _ = grouped(samples, 1.0, 1, [], FRAME, DOUBLE)
     assert owner.tolist() == [0] * 8
     assert float(points.area) == pytest.approx(8 * 1.55)
-
-
-def test_a_group_ends_at_the_border_of_a_region():
-    """The frame has half a metre per unit: x = 1 m is 2 units."""
-    samples = _pairs()
-    pinned = up_to(x=2.0)
-    _, owner, _ = grouped(samples, 1.0, 1, [pinned], FRAME, DOUBLE)
-    left = samples.position[:, 0] < 1
-    assert len(owner.unique()) == 2
-    assert len(owner[left].unique()) == len(owner[~left].unique()) == 1

@@ -1,6 +1,5 @@
 import dataclasses
 import math
-from pathlib import Path
 
 import pytest
 import torch
@@ -18,7 +17,6 @@ from gaussian_swaying.simulation.body import Material, MaterialRegion, Scene, Si
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.wind.field import WindField
 
-ROOT = Path(__file__).parents[2]
 DX = 0.12  # m
 FILLING = InteriorFilling()
 SETTINGS = {"shape": "ball", "size": 0.6, "spacing": 0.06}
@@ -187,20 +185,3 @@ def test_a_filled_solid_on_a_gpu(formulation):
         state, _ = simulation.advance(simulation.start())
         ends.append(state.position.cpu())
     near(ends[0], ends[1], 1e-5)
-
-
-SMALL = ["--config", str(ROOT / "configs/sim/solid_surface_wind.yaml"), "--device", "cpu"]
-SMALL += ["--scene.generator.init_args.spacing", "0.1", "--solver.dx", "0.2", "--camera.init_args.width", "32"]
-SMALL += ["--camera.init_args.height", "18", "--material.E", "5e3"]
-
-
-def test_the_pair_of_the_experiment_differs_in_the_wind_alone(tmp_path):
-    parser, made, work = Simulation.parser(), [], []
-    for extra in ([], ["--config", str(ROOT / "configs/sim/variants/solid_all_wind.yaml")]):
-        made.append(Simulation.from_settings(parser, parser.parse_args([*SMALL, *extra])))
-        work.append(made[-1].run(tmp_path / str(len(made)), 2, progress=False)["wind_work_J"])
-    surface, everywhere = (simulation.scene for simulation in made)
-    assert torch.equal(surface.points.position, everywhere.points.position)
-    assert torch.equal(surface.points.mass, everywhere.points.mass)
-    assert everywhere.patches.area.sum() > surface.patches.area.sum()
-    assert work[1] > work[0]

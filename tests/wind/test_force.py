@@ -61,33 +61,22 @@ def test_quadratic_linear_and_relative(law, device, dtype):
 
 
 def test_linear_law():
-    """1/2 rho A C_D |u| (u - v).n n: as `projected` at rest, linear in v on either side, and none in still air."""
+    """1/2 rho A C_D |u| (u - v).n n, and none in still air."""
     wind, velocity, normal, area = _random()
     options = {"drag": 0.7, "friction": 0.0, "lift": 0.0}
     force = aero_force(wind, velocity, normal, area, law="linear", **options)
     pressure = 0.5 * RHO * 0.7 * wind.norm() * ((wind - velocity) * normal).sum(-1)
     assert_close(force, (pressure * area)[:, None] * normal)
-    rest = torch.zeros_like(velocity)
-    at_rest = aero_force(wind, rest, normal, area, law="linear", **options)
-    assert_close(at_rest, aero_force(wind, rest, normal, area, law="projected", **options))
-    twice = aero_force(wind, 2 * velocity, normal, area, law="linear", **options)
-    assert_close(twice - at_rest, 2 * (force - at_rest))
     assert not aero_force(torch.zeros(3).double(), velocity, normal, area, law="linear", **options).any()
 
 
 def test_cross_flow_law():
-    """1/2 rho A C_D |v_r.n| (v_r.n) n: as `projected` across the flow, and half of it at 30 degrees incidence."""
+    """1/2 rho A C_D |v_r.n| (v_r.n) n."""
     wind, velocity, normal, area = _random()
     options = {"drag": 0.7, "friction": 0.0, "lift": 0.0}
     force = aero_force(wind, velocity, normal, area, law="cross_flow", **options)
     through = ((wind - velocity) * normal).sum(-1)
     assert_close(force, (0.5 * RHO * 0.7 * through.abs() * through * area)[:, None] * normal)
-    tilted, across = _vector(0.5, 0.75**0.5, 0), _vector(1, 0, 0)
-    for normal, share in ((across, 1.0), (tilted, 0.5)):
-        found, projected = (
-            _force((2.0, 0, 0), normal.tolist(), drag=0.5, law=law) for law in ("cross_flow", "projected")
-        )
-        assert_close(found, share * projected)
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -172,17 +161,6 @@ def test_a_plate_carries_the_air_of_a_cylinder_of_its_breadth():
     assert math.sqrt(0.2 / (0.2 + added_mass_per_area(1.0, 1.225))) == pytest.approx(0.415, abs=5e-4)
     assert AeroForce(added_mass=2.0, air_density=RHO).carried == added_mass_per_area(2.0, RHO)
     assert AeroForce().carried == AeroForce(added_mass=2.0, air_density=0.0).carried == 0.0
-
-
-def test_the_area_in_the_wind_is_capped():
-    """At so many times that at rest; below, and without a cap, it is what it is."""
-    F = torch.diag(_vector(3, 3, 1)) * _vector(1, 0.5, 0, 0.1).sqrt()[:, None, None]
-    patch, still = (_vector(0, 0, 1).expand(4, 3), _vector(1, 2, 1, 3)), torch.zeros(4, 3).double()
-    for cap, expected in ((2.0, [2, 4, 0, 2.7]), (None, [9, 9, 0, 2.7])):
-        area = AeroForce(max_area_ratio=cap).on_patches(still, still, F * _vector(1, 1, 1), patch)[1]
-        assert area.tolist() == pytest.approx(expected)
-    assert AeroForce().max_area_ratio == AeroForce(max_area_ratio=None).max_area_ratio == math.inf
-    assert AeroForce(max_area_ratio=1).max_area_ratio == 1.0
 
 
 def test_shapes_are_checked():

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from catalogue import BOUNDARIES, OBSTACLES, conditions, made
+from catalogue import BOUNDARIES, OBSTACLES, conditions
 from shared import alike, beyond, double, in_both, near, peak, rand, randn, seeded, value_error, without_waits
 from torch.testing import assert_close
 
@@ -18,7 +18,7 @@ from gaussian_swaying.geometry.regions import Everything, HalfSpace, Not, Union
 from gaussian_swaying.mpm.boundary import Nodes
 from gaussian_swaying.mpm.colliders import VelocityBox, Wall, plane_velocity
 
-from .bodies import block, lone, march, run_for
+from .bodies import block, march, run_for
 
 MOVING = KeyedPath([0.0, 0.2], [[0, 0, 0], [0.1, 0.05, 0]], [[0, 0, 0], [10, 20, 30]])
 UPPER = beyond(z=0.23)
@@ -87,25 +87,6 @@ def test_plane_and_box_leave_alone_what_is_near_but_free(formulation, kind, fric
             velocity = sign * double([0.3, -0.2, 0.25]).expand_as(points.position)
             state = run_for(formulation, [boundary], points, 0.04, velocity, gravity=(0, 0, 0))
             near(state.velocity, velocity, 1e-12)
-
-
-@in_both
-@pytest.mark.parametrize("wall", [HalfSpace([0, 0, 0.11], [0, 0, 1]), Box([-9, -9, 0.11], [9] * 3)])
-def test_separate_lets_go_of_what_moves_away_and_slip_does_not(formulation, wall):
-    points = block(low=(0, 0, 0.05))  # behind the wall lie the lowest nodes of either formulation
-    velocity = double([0.3, 0.0, 1.0]).expand_as(points.position)
-
-    def run(kind, friction=0.0):
-        boundary = made("Wall", wall, kind, friction)()
-        return run_for(formulation, [boundary], points, 0.02, velocity, gravity=(0, 0, 0)).velocity
-
-    near(run("separate"), velocity, 1e-12)
-    near(run("separate", 0.8), velocity, 1e-12)
-    slip = run("slip")
-    assert slip[:, 2].mean() < 0.8
-    assert float(slip[:, 0].mean()) == pytest.approx(0.3, rel=1e-9)
-    assert run("slip", 0.8)[:, 0].mean() < 0.29  # friction follows the removed normal velocity
-    assert float(run("sticky").mean(0)[0]) < 0.29
 
 
 @pytest.mark.parametrize("name", ACTING)
@@ -273,19 +254,6 @@ def test_bad_boundaries_are_refused():
             BOUNDARIES[kind](*given, **settings)
 
 
-@in_both
-def test_pin_holds_only_its_end(formulation):
-    points = block()
-    pin = made("PinnedRegion", beyond(z=0.34))()
-    state = run_for(formulation, [pin], points, 0.3)
-    held = points.position[:, 2] > 0.34
-    moved = (state.position - points.position).norm(dim=-1)
-    assert moved[held].max() < 0.01
-    # the static sag of a rod this long is 2 to 4 mm, and it swings to twice that; `updated` holds all nodes that the
-    # pinned layer touches. A pin that only resets its particles lets the rest fall at 70 % of free fall
-    assert 0.001 < moved[~held].max() < 0.02
-
-
 @pytest.mark.parametrize(("time", "acts"), [(0.4, False), (0.5, True), (0.9, True), (1.0, False)])
 def test_an_obstacle_stops_the_nodes_on_and_in_it_in_its_time(time, acts):
     """A ball of radius 2 without friction: what moves into it slides, from its surface inwards."""
@@ -338,12 +306,6 @@ def test_plane_velocity_kinds():
     assert plane_velocity(torch.zeros(1, 3), UP.float(), "separate", 0.5).tolist() == [[0, 0, 0]]
 
 
-@pytest.mark.parametrize("length", [1e-3, 1.0, 50.0])
-def test_the_length_of_the_normal_does_not_matter(length):
-    plane = Wall(HalfSpace([0.0, 0.0, 0.0], [0.6 * length, 0.0, -0.8 * length]))
-    assert_close(plane.normal, double([0.6, 0.0, -0.8]))
-
-
 @in_both
 def test_block_slides_down_an_incline_with_coulombs_acceleration(formulation):
     """Static below the friction angle; a = g (sin - mu cos) above. Gravity is tilted instead of the plane."""
@@ -351,31 +313,20 @@ def test_block_slides_down_an_incline_with_coulombs_acceleration(formulation):
     gravity = (9.8 * math.sin(angle), 0.0, -9.8 * math.cos(angle))
     seconds = 0.4
     # the lowest nodes are in contact from the start, so nothing bounces
-    plane = Wall(HalfSpace([0, 0, 0.06], [0, 0, 1]), "separate", 0.2)
+    plane = Wall(HalfSpace([0, 0, 0.06], [0, 0, 2]), "separate", 0.2)
     x, _, z = run_for(formulation, [plane], points, seconds, gravity=gravity).velocity.mean(0).tolist()
     # mu times the momentum that the plane gave upwards, less what bulging turns aside, more at the slow start
     lost = 9.8 * seconds * math.sin(angle) - x
     assert lost == pytest.approx(0.2 * (9.8 * seconds * math.cos(angle) + z), rel=0.03)
     assert abs(z) < 0.05 * 9.8 * seconds
     # damped, so that it does not hop: with mu = 1 it leans by less than twice the static g sin m c, c as above
-    plane = Wall(HalfSpace([0, 0, 0.06], [0, 0, 1]), "separate", 1.0)
+    plane = Wall(HalfSpace([0, 0, 0.06], [0, 0, 0.3]), "separate", 1.0)
     held = run_for(formulation, [plane], points, seconds, gravity=gravity, damping=30.0)
     leans = 9.8 * math.sin(angle) * (0.4 * 2.6 + 0.6) * 0.4**2 * 100 / 2e4
     assert (held.position - points.position)[:, 0].mean() < 2 * leans
 
 
 # ---- velocity boxes, at rest and travelling
-
-
-@in_both
-def test_velocity_box_drives_only_its_side(formulation):
-    points = lone([[0.0, 0.0, 0.05], [0.0, 0.0, -0.25]])
-    drive = VelocityBox(Box([-9, -9, -0.05], [9, 9, 9]), [0.5, 0.0, -0.3], start=0.02, end=0.05)
-    ends = march(MPMSolver(0.1, formulation, gravity=(0, 0, 0), boundaries=[drive]), points, 0.01, 8)
-    speed = torch.stack([state.velocity for state in ends])
-    assert float(peak(speed[:, 1])) == 0.0
-    assert float(peak(speed[:3, 0])) == 0.0  # states 0 to 2 lie before the window
-    torch.testing.assert_close(speed[3, 0], double([0.5, 0.0, -0.3]))
 
 
 def test_a_travelling_box_takes_its_nodes_from_where_it_is():

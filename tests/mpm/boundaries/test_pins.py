@@ -25,7 +25,7 @@ from shared import (
 )
 from torch.testing import assert_close
 
-from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedPoints, PinnedRegion
+from gaussian_swaying import Box, MPMSolver, PinnedPoints, PinnedRegion
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.keyed_path import KeyedPath
 from gaussian_swaying.geometry.regions import Everything, HalfSpace, Sphere
@@ -38,12 +38,11 @@ from gaussian_swaying.mpm.pins import (
     face,
     thickness,
 )
-from gaussian_swaying.mpm.state import GridSpec, support_force
+from gaussian_swaying.mpm.state import GridSpec
 from gaussian_swaying.mpm.transfer import bspline_stencil, gather
 
 DX, STEP = 0.1, 0.045
 TOP = beyond(z=-0.03)
-GROUND = Wall(HalfSpace([0, 0, -9], [0, 0, 1]))
 
 
 def _sheet(dtype=torch.float64, layers=1, width=8, height=10, turn=0.0, shift=(0.0, 0.0, 0.0), e=4e3):
@@ -161,19 +160,6 @@ def test_a_hinge_is_a_line_in_the_middle_plane(make, number):
     assert least <= len(rows) <= most
 
 
-def test_groups_are_joined_until_they_are_apart():
-    place = double([0.0, 0.1, 0.32, 0.9, 1.0, 2.0])
-    position = torch.nn.functional.pad(place[:, None], (0, 2))
-    mass, cell = torch.ones(6).double(), torch.tensor([7, 7, 8, 9, 9, 12])
-    assert pinning.groups(position, mass, cell, 0.2).tolist() == [0, 0, 1, 2, 2, 3]
-    assert pinning.groups(position, mass, cell, 0.3).tolist() == [0, 0, 0, 1, 1, 2]
-    assert pinning.groups(position, mass, cell, 0.9).tolist() == [0, 0, 0, 0, 0, 1]
-    assert pinning.groups(position[:0], mass[:0], cell[:0], 0.3).tolist() == []
-    heavy = double([1.0, 1, 1, 1, 3, 1])
-    found = pinning.means(position, heavy, torch.tensor([0, 0, 0, 1, 1, 2]))
-    assert_close(found[:, 0], double([0.14, 0.975, 2.0]))
-
-
 @pytest.mark.parametrize("shift", [0.0, 0.2, 0.4, 0.45, 0.6, 0.8])
 def test_a_place_just_outside_extends_the_nearest_cell(shift):
     """A linear field is read exactly, although nodes beyond the material have no mass and do not move."""
@@ -244,15 +230,6 @@ def test_a_line_along_the_grid_keeps_all_its_cells():
     assert int(slope.sum()) >= 2 * len(line)
 
 
-def test_rows_come_in_the_order_of_their_release():
-    product = torch.eye(4).double()
-    product[0, 1] = product[1, 0] = 0.99  # nearly the same row
-    late = torch.tensor([False, True, False, True])
-    assert pinning.independent_rows(product, torch.zeros(4)).tolist() == [0, 2, 3]
-    assert pinning.independent_rows(product, 1.0 - late.double()).tolist() == [1, 3, 2]
-    assert pinning.independent_rows(torch.zeros(2, 2).double(), torch.zeros(2)).tolist() == []
-
-
 def test_pins_in_the_same_cells_agree():
     """Each alone would move the points of the other."""
     points = _sheet()
@@ -305,16 +282,6 @@ def test_of_two_boundaries_at_the_same_place_the_last_one_counts():
         state = _run(solver, points, 2)[-1]
         found = _read(_own_places(solver), state)[:, 0]
         assert_close(found, double([[0.0, speed, 0.0]]).expand_as(found))
-
-
-def test_a_pin_that_opens_lets_go():
-    pin = PinnedRegion(TOP, end=0.0055)
-    solver = MPMSolver(DX, boundaries=[pin])
-    state = _run(solver, _sheet(), 5, every=5)[-1]
-    places = _own_places(solver)
-    for _ in range(3):
-        state = solver.step(state, 1e-3)
-    assert bool((_read(places, state)[:, 0, 2] < -0.015).all())
 
 
 def test_pins_act_within_their_windows():
@@ -401,77 +368,10 @@ def test_supports_take_the_momentum_of_the_forces(formulation):
     assert states[-1].impulse[2].norm() > 0.1 * float(weight.norm()) * 0.06
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["hinge", "clamp", "nodes"])
-def test_two_pins_carry_weight_and_wind_at_rest(kind):
-    points = _sheet(width=12, shift=(0.03, 0, 0))  # symmetric on the grid
-    ends = [Box([None, None, -0.03], [0.13, None, None]), beyond(x=0.47, z=-0.03)]
-    solver = MPMSolver(DX, boundaries=[PinnedRegion(end, kind) for end in ends], damping=6.0)
-    wind = torch.zeros_like(points.position)
-    wind[:, 1] = 0.3 * 9.8 * points.mass
-    state = solver.init_state(points)
-    state = solver.rollout(state, 1e-3, 3000, lambda _: wind)
-    later = solver.rollout(state, 1e-3, 100, lambda _: wind)
-    found, weight = support_force(state, later), 9.8 * float(points.mass.sum())
-    assert found.shape == (2, 3)
-    expected = double([0.0, 0.3 * weight, -weight])
-    near(found.sum(0), expected, 0.01 * weight)
-    near(found[0, 1:], found[1, 1:], 0.01 * weight)
-    assert float(found[0, 0]) == pytest.approx(-float(found[1, 0]), abs=0.01 * weight)
-    assert torch.equal(support_force(state, state), torch.zeros(2, 3).double())
-
-
 # ---- gradients, batches, bits
 
 
-def _small(mass=None):
-    points = _sheet(width=3, height=4)
-    return points if mass is None else dataclasses.replace(points, mass=mass)
-
-
-@pytest.mark.parametrize("kind", ["hinge", "clamp"])
-def test_gradients_with_respect_to_velocity_and_mass(kind):
-    points = _small()
-    generator = seeded(3)
-    velocity = 0.2 * randn(points.position.shape, generator=generator)
-
-    def run(velocity, mass):
-        solver = MPMSolver(DX, boundaries=[PinnedRegion(TOP, kind), PinnedPoints([[0.1, 0.0, -0.13]], end=0.0025)])
-        state = solver.init_state(_small(mass), velocity)
-        return solver.rollout(state, 1e-3, 4).position
-
-    inputs = (velocity.requires_grad_(), points.mass.clone().requires_grad_())
-    assert torch.autograd.gradcheck(run, inputs, eps=1e-6, atol=1e-7, rtol=1e-5)
-
-
-def test_scenes_of_a_batch_are_independent():
-    one, two = _sheet(), _sheet(shift=(0.03, 0.01, -0.02))
-    fields = ("position", "mass", "volume", "youngs_modulus", "poisson_ratio")
-    both = MaterialPoints(**{name: torch.stack([getattr(one, name), getattr(two, name)]) for name in fields})
-    make = lambda: [PinnedRegion(beyond(z=-0.06)), PinnedPoints([[0.2, 0.01, -0.2]], start=0.02)]  # noqa: E731
-    ends = []
-    for points in (one, two, both):
-        solver = MPMSolver(DX, boundaries=make())
-        state = solver.init_state(points)
-        ends.append(solver.rollout(state, 1e-3, 60))
-    for k in range(2):
-        near(ends[2].position[k], ends[k].position, 1e-13)
-        near(ends[2].impulse[k], ends[k].impulse, 1e-15)
-    assert ends[2].impulse.shape == (2, 2, 3)
-
-
 # ---- kinds and errors
-
-
-def test_the_kind_suits_the_formulation():
-    points = _sheet()
-    for formulation, kinds in (("total", ("hinge", "hinge", "nodes")), ("updated", ("nodes", "nodes", "nodes"))):
-        boundaries = [
-            PinnedRegion(TOP),
-            PinnedRegion(TOP, angular_velocity=[0, 0, 1]),
-            Wall(HalfSpace([0, 0, -9], [0, 0, 1])),
-        ]
-        assert _started(points, *boundaries, formulation=formulation).bound.kinds == kinds
 
 
 def test_a_subclass_with_its_own_forward_acts_on_nodes():
@@ -524,43 +424,6 @@ def test_what_cannot_be_pinned_is_refused(pin, settings, message, monkeypatch):
         _started(_sheet(), pin, **settings)
 
 
-def test_only_what_has_a_target_moves():
-    assert PinnedRegion(TOP, velocity=[0, 1, 0]).moves
-    assert not PinnedRegion(TOP).moves
-    assert not PinnedPoints([[0, 0, 0]]).moves
-
-
-@pytest.mark.parametrize(
-    ("place", "massless", "first"),
-    [
-        # on the border of the cell with the nodes 2, 3 and 4, and e beyond: the largest weight at the fourth is
-        # e^2 / 2 times 0.75 for each other axis, and does not count below 1e-6
-        (2.5, (4,), 2),
-        (2.5 + math.sqrt(0.95e-6 / (0.5 * 0.75**2)), (4,), 2),
-        (2.5 + math.sqrt(1.05e-6 / (0.5 * 0.75**2)), (4,), 1),
-        (2.95, (), 2),
-        (2.95, (4,), 1),  # the cell before, though the place lies nearly half a cell beyond it
-        (2.95, (2,), 3),
-        (2.95, (2, 4), -1),  # beyond the cell before, the weight of its node 2 is -0.15: it does count
-    ],
-)
-def test_a_cell_beside_a_place_has_all_the_nodes_that_it_needs(place, massless, first):
-    grid = GridSpec(0.5, (-1, 2, 0), (7, 6, 8))
-    for axis in range(3):
-        node = double([3.0] * 3)
-        node[axis] = place
-        position = 0.5 * (node + torch.tensor(grid.offset))
-        index = torch.cartesian_prod(*(torch.arange(count) for count in grid.resolution))
-        massive = ~torch.isin(index[:, axis], torch.tensor(massless, dtype=torch.long))
-        found = int(pinning.cells_of_places(position[None], grid, massive))
-        if first == -1:
-            assert found == -1
-        else:
-            expected = [2, 2, 2]
-            expected[axis] = first
-            assert index[found].tolist() == expected
-
-
 def _box(x, y, z, step=0.25, turn=0.0):
     """Points in a box of so many cells, one corner at the origin, turned about y."""
     axes = [(torch.arange(max(round(side / step), 1)).double() + 0.5) * step * DX for side in (x, y, z)]
@@ -586,23 +449,6 @@ def test_the_face_lies_between_held_and_free_points(turn):
     assert len(place) == 4 * 8  # each held point of the last layer has its partner
     near(place @ normal, torch.full((32,), 0.2, dtype=torch.float64), 1e-12)
     near(across, normal.expand_as(across), 1e-12)
-
-
-def test_what_is_far_apart_has_no_face():
-    rest = torch.cat([_box(1, 1, 1), _box(1, 1, 1) + 0.35])
-    held = torch.arange(len(rest)) < len(rest) // 2
-    assert len(face(rest, held, DX)[0]) == 0
-    assert len(face(rest, torch.ones_like(held), DX)[0]) == 0
-    assert len(face(rest, held, 4 * DX)[0]) > 0
-
-
-def test_slopes_lie_along_the_face_or_are_all_three():
-    normal = double([[0.0, 0.6, 0.8], [0.1, 0.0, 0.0]])
-    some, every = along_face(normal)
-    assert_close(some[:2] @ some[:2].T, torch.eye(2).double())
-    near(some @ normal[0], torch.zeros(3).double(), 1e-15)
-    assert (some[2] == 0).all()
-    assert torch.equal(every, EYE)
 
 
 def test_a_large_face_takes_larger_patches():
@@ -699,3 +545,64 @@ def test_a_clamp_that_opens_keeps_its_stiffness():
     assert longest((held.position - rest)[rest[:, 0] < 0.05]) < 1e-12
     fallen = solver.rollout(held, 1e-3, 100)
     assert (fallen.velocity[:, 2] < -0.5).all()
+
+
+def test_groups_are_joined_until_they_are_apart():
+    place = double([0.0, 0.1, 0.32, 0.9, 1.0, 2.0])
+    position = torch.nn.functional.pad(place[:, None], (0, 2))
+    mass, cell = torch.ones(6).double(), torch.tensor([7, 7, 8, 9, 9, 12])
+    assert pinning.groups(position, mass, cell, 0.2).tolist() == [0, 0, 1, 2, 2, 3]
+    assert pinning.groups(position, mass, cell, 0.3).tolist() == [0, 0, 0, 1, 1, 2]
+    assert pinning.groups(position, mass, cell, 0.9).tolist() == [0, 0, 0, 0, 0, 1]
+    assert pinning.groups(position[:0], mass[:0], cell[:0], 0.3).tolist() == []
+    heavy = double([1.0, 1, 1, 1, 3, 1])
+    found = pinning.means(position, heavy, torch.tensor([0, 0, 0, 1, 1, 2]))
+    assert_close(found[:, 0], double([0.14, 0.975, 2.0]))
+
+
+@pytest.mark.parametrize(
+    ("place", "massless", "first"),
+    [
+        # on the border of the cell with the nodes 2, 3 and 4, and e beyond: the largest weight at the fourth is
+        # e^2 / 2 times 0.75 for each other axis, and does not count below 1e-6
+        (2.5, (4,), 2),
+        (2.5 + math.sqrt(0.95e-6 / (0.5 * 0.75**2)), (4,), 2),
+        (2.5 + math.sqrt(1.05e-6 / (0.5 * 0.75**2)), (4,), 1),
+        (2.95, (), 2),
+        (2.95, (4,), 1),  # the cell before, though the place lies nearly half a cell beyond it
+        (2.95, (2,), 3),
+        (2.95, (2, 4), -1),  # beyond the cell before, the weight of its node 2 is -0.15: it does count
+    ],
+)
+def test_a_cell_beside_a_place_has_all_the_nodes_that_it_needs(place, massless, first):
+    grid = GridSpec(0.5, (-1, 2, 0), (7, 6, 8))
+    for axis in range(3):
+        node = double([3.0] * 3)
+        node[axis] = place
+        position = 0.5 * (node + torch.tensor(grid.offset))
+        index = torch.cartesian_prod(*(torch.arange(count) for count in grid.resolution))
+        massive = ~torch.isin(index[:, axis], torch.tensor(massless, dtype=torch.long))
+        found = int(pinning.cells_of_places(position[None], grid, massive))
+        if first == -1:
+            assert found == -1
+        else:
+            expected = [2, 2, 2]
+            expected[axis] = first
+            assert index[found].tolist() == expected
+
+
+def test_what_is_far_apart_has_no_face():
+    rest = torch.cat([_box(1, 1, 1), _box(1, 1, 1) + 0.35])
+    held = torch.arange(len(rest)) < len(rest) // 2
+    assert len(face(rest, held, DX)[0]) == 0
+    assert len(face(rest, torch.ones_like(held), DX)[0]) == 0
+    assert len(face(rest, held, 4 * DX)[0]) > 0
+
+
+def test_slopes_lie_along_the_face_or_are_all_three():
+    normal = double([[0.0, 0.6, 0.8], [0.1, 0.0, 0.0]])
+    some, every = along_face(normal)
+    assert_close(some[:2] @ some[:2].T, torch.eye(2).double())
+    near(some @ normal[0], torch.zeros(3).double(), 1e-15)
+    assert (some[2] == 0).all()
+    assert torch.equal(every, EYE)

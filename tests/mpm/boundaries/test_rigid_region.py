@@ -9,7 +9,7 @@ from scipy.optimize import curve_fit
 from shared import ZERO, beyond, double, in_both, longest, near, peak, solid, up_to, value_error
 from torch.testing import assert_close
 
-from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedPoints, PinnedRegion
+from gaussian_swaying import Box, MPMSolver, PinnedPoints, PinnedRegion
 from gaussian_swaying.geometry.regions import Everything, HalfSpace, Union
 from gaussian_swaying.mpm.colliders import Obstacle
 from gaussian_swaying.mpm.pins import RigidRegion
@@ -119,20 +119,6 @@ def test_a_handle_leads_the_whole_part(formulation):
     wanted = pivot + (points.position - pivot) @ turn.mT
     near(state.position[right(points)], wanted[right(points)], 1e-5)
     near(state.F_total[right(points)], turn.expand(int(right(points).sum()), 3, 3), 1e-4)
-
-
-def test_scenes_of_a_batch_do_not_know_each_other():
-    points, solver = bar(RigidRegion(RIGHT))
-    other = solid(points.position * torch.tensor([1.0, 0.8, 1.0]), 2e-5, 200.0, 1e4, 0.2)
-    together = solver.like(solver.settings)
-    state = advance(together, together.init_state(MaterialPoints.stack([points, other])), 0.1, 3)
-    for k, alone in enumerate((points, other)):
-        single = solver.like(solver.settings)
-        begin = single.init_state(alone)
-        count = together.substeps(together.init_state(MaterialPoints.stack([points, other])), 0.1 / 3)
-        for _ in range(3):
-            begin = single.rollout(begin, 0.1 / 3 / count, count)
-        near(state.position[k], begin.position, 1e-10)
 
 
 @in_both

@@ -7,7 +7,7 @@ from shared import ZERO, double, peak, value_error
 from torch.testing import assert_close
 
 from gaussian_swaying import Contact, MaterialPoints, PinnedPoints
-from gaussian_swaying.geometry.regions import HalfSpace, Sphere
+from gaussian_swaying.geometry.regions import Sphere
 from gaussian_swaying.kernels.derive import on_tensors
 from gaussian_swaying.mpm import contact, contact_kernels
 from gaussian_swaying.mpm.colliders import Obstacle
@@ -85,16 +85,6 @@ def test_a_collision_is_the_same_in_float32_and_float64(device, iterations, monk
     momentum = (points.mass[:, None] * (speeds - velocity)).sum(0) + impulse.sum(0)
     gravity = points.mass.sum() * 6 * DT * double([0.0, 0.0, -9.8])
     assert_close(momentum, gravity, rtol=0, atol=1e-12)  # what the boundaries took is what the sheets lost
-
-
-def test_iterations_are_counted_where_there_are_obstacles(device, monkeypatch):
-    """One in every substep of a sheet that presses on the ground."""
-    monkeypatch.setattr(contact, "MOST_ITERATIONS", 1)
-    points = sheet(5, 5, dtype=torch.float32).map(lambda t: t.to(device))
-    ground = Obstacle(HalfSpace([0.0, 0.0, -0.004], [0.0, 0.0, 1.0]))
-    solver, state = scene(points, Contact(), [ground], transfer="kernels", gravity=(0.0, 0.0, -9.8))
-    solver.rollout(state, DT, 6)
-    assert solver.kernels.touching.rounds == 6
 
 
 def test_the_lists_are_those_of_a_tree(device):

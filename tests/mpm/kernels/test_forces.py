@@ -29,21 +29,6 @@ from .bodies import (
 
 
 @in_both
-def test_the_cap_on_the_area_acts(kernel_device, formulation):
-    points = make_points(kernel_device)
-    free, capped = make_load(points), make_load(points, max_area_ratio=0.5)
-    solver = make_solver("kernels", formulation)
-    start = set_going(solver, points)
-    ends = [solver.rollout(start, DT, 1, load) for load in (free, capped, free, capped, free)]
-    for k in (2, 3, 4):
-        if formulation == "total":
-            assert torch.equal(ends[k].velocity, ends[k - 2].velocity)
-    gained = [float((end.work - start.work).abs()) for end in ends]
-    assert gained[1] < 0.9 * gained[0]
-    assert gained[2:] == pytest.approx(gained[:3], rel=1e-5)
-
-
-@in_both
 def test_forces_and_drag_of_step(kernel_device, formulation):
     points = make_points(kernel_device)
     force = (0.3 * noise(8, *points.position.shape)).to(kernel_device)

@@ -325,20 +325,6 @@ def test_a_broken_particle_is_reported_and_breaks_nothing_else(kernel_device, tr
     check_agreement([good, again], tolerance=1e-4 if kernel_device.type == "cuda" else TOLERANCE)
 
 
-def test_a_fresh_solver_goes_on_to_the_same_bits():
-    """As in a run that is resumed: particles are sorted after as many substeps, though the speed has changed."""
-    points = make_points("cpu", count=64)
-    one, other = (make_solver("kernels") for _ in range(2))
-    state = one.init_state(points, 1.5 * noise(1, 64, 3))
-    other.init_state(points)
-    middle = one.rollout(state, 0.3 * DT, 150)
-    end = one.rollout(middle, 0.3 * DT, 150)
-    again = other.rollout(middle, 0.3 * DT, 150)
-    for name in ("position", "velocity", "F_elastic"):
-        assert torch.equal(getattr(end, name), getattr(again, name)), name
-    assert not torch.equal(end.position, middle.position)
-
-
 # ---- a CPU sums in a fixed order: any number of threads gives the same bits
 
 

@@ -64,7 +64,10 @@ def test_kernel_agrees_with_torch(kernel_device, monkeypatch, wind, law):
     assert torch.allclose(fast.impulse, slow.impulse, rtol=1e-4, atol=1e-4 * float(peak(slow.impulse)))
 
 
-def test_scenes_of_a_batch_have_winds_of_their_own(kernel_device):
+@pytest.mark.parametrize("kernels", [True, False])
+def test_scenes_of_a_batch_have_winds_of_their_own(kernel_device, kernels, monkeypatch):
+    if not kernels:
+        monkeypatch.setattr(Modes, "_kernel", lambda *given: None)
     found = []
     winds = [WindField([4.0, 0.0, 0.0]), WindField([0.0, 7.0, 0.0])]
     aero = AeroForce(C_D=1.0, C_F=0.1, C_L=0.0, law="projected").to(kernel_device)

@@ -1,15 +1,14 @@
 """A solver that the package does not know: through the simulation, the recorder, the live page and ``eval``."""
 
-import importlib.util
 import json
-from pathlib import Path
 
 import pytest
 import torch
 import yaml
+from own_springs import Springs, flag
 from shared import near, peak, refused, up_to
 
-from gaussian_swaying import PinnedRegion, Simulation
+from gaussian_swaying import AeroForce, PinnedRegion, Simulation
 from gaussian_swaying.cli.evaluate import main as evaluate
 from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.geometry.regions import Sphere
@@ -19,35 +18,14 @@ from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.simulation.model import Edit
 
 BOX = {"min": [None, None, None], "max": [0.11, None, None]}
-FILE = Path(__file__).parents[1] / "mass_spring_cloth.py"
-
-
-@pytest.fixture(scope="module")
-def cloth():
-    spec = importlib.util.spec_from_file_location("mass_spring_cloth", FILE)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture
-def simulation(cloth):
-    pins = [PinnedRegion(up_to(x=0.06))]
-    return cloth.flag(cloth.MassSpringCloth(0.1, (0.0, 0.0, -2.0), boundaries=pins))
+def simulation():
+    return flag(Springs(boundaries=[PinnedRegion(up_to(x=0.06))]))
 
 
-def test_the_example_agrees_with_the_material_points(cloth, tmp_path, capsys):
-    assert cloth.main(tmp_path, frames=12) < 0.1
-    assert "of the way" in capsys.readouterr().out
-    summary = json.loads((tmp_path / "springs" / "summary.json").read_text())
-    assert (summary["status"], summary["formulation"]) == ("complete", "mass_spring")
-    assert "grid" not in summary
-    assert evaluate([str(tmp_path / "springs"), str(tmp_path / "mpm"), "--no-video", "--device", "cpu"]) == 0
-    found = json.loads((tmp_path / "springs" / "eval" / "eval.json").read_text())
-    assert found["worst"]["psnr_db"] > 35
-
-
-def test_a_run_is_resumed_bit_for_bit(cloth, simulation, tmp_path):
+def test_a_run_is_resumed_bit_for_bit(simulation, tmp_path):
     simulation.run(tmp_path / "whole", 6, progress=False)
     simulation.run(tmp_path / "parts", 3, progress=False)
     simulation.run(tmp_path / "parts", 6, resume=True, progress=False)
@@ -55,14 +33,16 @@ def test_a_run_is_resumed_bit_for_bit(cloth, simulation, tmp_path):
         whole, parts = (load_trajectory(tmp_path / name / "trajectory.npz", k) for name in ("whole", "parts"))
         assert torch.equal(whole[0], parts[0])
         assert torch.equal(whole[1], parts[1])
+    summary = json.loads((tmp_path / "parts" / "summary.json").read_text())
+    assert (summary["status"], summary["formulation"]) == ("complete", "springs")
+    assert "grid" not in summary
+    assert evaluate([str(tmp_path / "parts"), str(tmp_path / "whole"), "--no-video", "--device", "cpu"]) == 0
 
 
-def test_energy_is_kept_and_pins_hold(cloth):
+def test_energy_is_kept_and_pins_hold(simulation):
     """Without wind and damping, what falls turns into motion and stretch, to the order of the substep."""
-    pins = [PinnedRegion(up_to(x=0.06))]
-    simulation = cloth.flag(cloth.MassSpringCloth(0.1, (0.0, 0.0, -2.0), boundaries=pins))
     simulation.wind = None
-    simulation.aero = simulation.aero.__class__(air_density=0.0)
+    simulation.aero = AeroForce(air_density=0.0)
     frames = list(simulation.frames(10))
     first, last = frames[0].health, frames[-1].health
     total = [health.kinetic + health.elastic + health.potential for health in (first, last)]
@@ -121,13 +101,12 @@ def test_a_yaml_names_a_solver_and_a_wind(tmp_path, monkeypatch, capsys):
     """With its class path; the configuration of the run has both, and either excludes the usual group."""
     (tmp_path / "my_jet.py").write_text(JET)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.syspath_prepend(FILE.parent)
     pins = [{"class_path": "PinnedRegion", "init_args": {"region": {"class_path": "Box", "init_args": BOX}}}]
     config = {
         "scene": {"generator": {"class_path": "FlagScene", "init_args": {"spacing": 0.1}}},
         "custom_wind": {"class_path": "my_jet.Jet", "init_args": {"speed": 5.0}},
         "custom_solver": {
-            "class_path": "mass_spring_cloth.MassSpringCloth",
+            "class_path": "own_springs.Springs",
             "init_args": {"dx": 0.2, "gravity": [0.0, 0.0, 0.0], "boundaries": pins},
         },
         "recorder": {"renders": []},
@@ -137,7 +116,7 @@ def test_a_yaml_names_a_solver_and_a_wind(tmp_path, monkeypatch, capsys):
     options = ["--config", str(file), "--frames", "3", "--device", "cpu"]
     assert main([*options, "--output", str(folder)]) == 0
     summary = json.loads((folder / "summary.json").read_text())
-    assert (summary["formulation"], summary["frames"]) == ("mass_spring", 3)
+    assert (summary["formulation"], summary["frames"]) == ("springs", 3)
     assert summary["wind_work_J"] > 0
     kept = yaml.safe_load((folder / "config.yaml").read_text())
     assert kept["custom_wind"]["init_args"] == {"speed": 5.0}
