@@ -9,7 +9,7 @@ import webdataset
 
 from gaussian_swaying.cli.shipped import folder as folder_of_shipped
 from gaussian_swaying.sweeps.dataset import write_shards
-from gaussian_swaying.sweeps.plan import make_plan, read_sweep
+from gaussian_swaying.sweeps.plan import read_sweep
 from gaussian_swaying.sweeps.run import run_sweep
 
 SWEEP = """
@@ -21,7 +21,7 @@ axes:
 
 if __name__ == "__main__":  # the workers import this file
     Path("flags.yaml").write_text(SWEEP.format(base=folder_of_shipped() / "sim" / "flag.yaml"))
-    plan = make_plan(read_sweep("flags.yaml"))
+    plan = read_sweep("flags.yaml")
     run_sweep(plan, "flags", workers=1, together=4, device="cpu", progress=False)
     shards = [str(file) for file in write_shards("flags", positions=True)]
     data = webdataset.WebDataset(shards, shardshuffle=False).decode().to_tuple("parameters.npy", "positions.npy")

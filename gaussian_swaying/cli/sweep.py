@@ -67,7 +67,7 @@ def explain(error: BaseException) -> str:
 def sweep(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     """Do the runs that are missing, and report."""
     from gaussian_swaying.sweeps.dataset import PARQUET, SHARDS, TABLE, write_shards
-    from gaussian_swaying.sweeps.plan import make_plan, read_sweep
+    from gaussian_swaying.sweeps.plan import read_sweep
     from gaussian_swaying.sweeps.run import check_extra, run_sweep
 
     if options.shards is not None:
@@ -76,7 +76,7 @@ def sweep(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     file = Path(with_shipped(["--config", options.sweep], "sweep")[1])
     parser = Simulation.parser()
     with guessing(parser):
-        plan = make_plan(read_sweep(file, lambda name: with_shipped(["--config", name], "sim")[1]), parser)
+        plan = read_sweep(file, lambda name: with_shipped(["--config", name], "sim")[1], parser)
     if options.list:
         for name, run in zip(plan.names, plan.runs, strict=True):
             print(f"{name}  {', '.join(f'{axis} {value}' for axis, value in run.items())}")
@@ -87,7 +87,7 @@ def sweep(options: argparse.Namespace, arguments: Sequence[str]) -> int:
         results = run_sweep(plan, folder, explain=explain, **others)
     counts = Counter(result["status"] for result in results.values())
     print(f"{len(results)} runs: {', '.join(f'{count} {status}' for status, count in sorted(counts.items()))}")
-    wrote = [folder / "runs", folder / TABLE, *sorted(folder.glob("contact_sheet*.png"))]
+    wrote = [folder / "runs", folder / TABLE, folder / "contact_sheet.png"]
     complete = [name for name, result in results.items() if result["status"] == "complete"]
     if options.shards is not None and complete:
         place = folder / "runs" / complete[0]  # with all that was recorded

@@ -15,11 +15,10 @@ from gaussian_swaying.inverse.tracks import Tracks
 from gaussian_swaying.inverse.variants import states_of
 from gaussian_swaying.inverse.videos import Footage
 from gaussian_swaying.mpm.state import State
-from gaussian_swaying.rendering.cameras.camera import Camera, project
+from gaussian_swaying.rendering.cameras.camera import project
 from gaussian_swaying.simulation.measure import SimulationDiverged
 from gaussian_swaying.simulation.simulation import Simulation
 
-LEAST_FACING = 0.05  # least weight of the residuals of a point that is seen edge-on
 MOMENTS, PATCHES = 4, 4  # parts of the time, and squares along each side of the object: clusters
 NOISE = 0.5  # distance of a track that its own error explains [pixels]
 HELD, LEAST_HELD = 7, 6  # one of so many tracks is not fitted, if there are at least so many of them
@@ -28,8 +27,7 @@ HELD, LEAST_HELD = 7, 6  # one of so many tracks is not fitted, if there are at 
 class Evidence:
     """Where Gaussians of a simulation are, beside where they were followed in the video of a camera.
 
-    Residuals are multiplied by :func:`facing`, as a camera hardly tells what it sees edge-on, and by ``trust`` (F, T).
-    ``rest`` are the places at rest [scene units], on the CPU, shape (T, 3).
+    Residuals are multiplied by ``trust`` (F, T). ``rest`` are the places at rest [scene units], on the CPU, (T, 3).
     """
 
     def __init__(self, simulation: Simulation, video: Footage, tracks: Tracks, trust: Tensor | None = None) -> None:
@@ -40,7 +38,6 @@ class Evidence:
         self._means = scene.model.means.detach()[scene.moving[index]]
         self.rest = self._means.cpu()
         self._cluster = _patch_of(self.rest)
-        self._weight = facing(scene.rest().normals[scene.moving[index]].cpu(), self.rest, video.cameras[0])[:, None]
 
     def on(self, simulation: Simulation) -> Evidence:
         """The same tracks for the same scene on another grid."""
@@ -58,9 +55,8 @@ class Evidence:
     def beside(self, shown: Tensor, frame: int) -> tuple[Tensor, Tensor]:
         """Residuals of some states in a frame [pixels], shape (B, R, 2), and their clusters, shape (R,)."""
         seen = self.tracks.seen[frame]
-        weight = self._weight[seen] if self.trust is None else self._weight[seen] * self.trust[frame, seen, None]
         off = self.pixels(shown[:, seen], frame) - self.tracks.position[frame, seen]
-        return weight * off, self._cluster[seen]
+        return off if self.trust is None else self.trust[frame, seen, None] * off, self._cluster[seen]
 
 
 def compare(
@@ -69,71 +65,41 @@ def compare(
     values: Sequence[Values],
     times: Sequence[float],
     moving: bool = False,
-    tick: Callable[[int], object] = int,
-) -> Block:
-    """Simulate variants, with the same substeps unless one diverges, and compare each with the videos at times [s].
-
-    The first frame is compared if the videos begin in motion.
-    """
-    wanted = [(time, [(0, time)] if time > 0 or moving else []) for time in times]  # at rest all variants are alike
-    try:
-        return _compared(simulation, evidence, values, wanted, 1, True, tick)[0]
-    except SimulationDiverged:
-        return _compared(simulation, evidence, values, wanted, 1, False, tick)[0]
-
-
-def compare_starts(
-    simulation: Simulation,
-    evidence: Sequence[Evidence],
-    values: Sequence[Values],
-    times: Sequence[float],
-    starts: Sequence[float],
+    starts: Sequence[float] = (),
     tick: Callable[[int], object] = int,
 ) -> list[Block]:
-    """Residuals of variants as if they had begun to move at each of some times, from one simulation of each.
+    """Simulate variants, and compare each with the videos at times [s], at 0 only if these begin in motion.
 
-    The wind must not depend on time.
+    The variants have the same substeps unless one diverges. With ``starts``, of a wind that does not depend on time,
+    there is a block for each of them: what the residuals were if all had begun to move then, from one simulation.
     """
-    wanted: dict[int, list[tuple[int, float]]] = {}  # what is compared with a state, by its time [microseconds]
-    for number, start in enumerate(starts):
+    wanted: dict[float, tuple[float, list[tuple[int, float]]]] = {}  # what is compared with a state, by its time
+    for number, start in enumerate(starts or [0.0]):
         for time in times:
-            wanted.setdefault(round(1e6 * max(0.0, time - start)), []).append((number, time))
-    own = [{name: value for name, value in one.items() if name != FILM_START} for one in values]
-    pairs = [(1e-6 * moment, what) for moment, what in sorted(wanted.items())]
-    return _compared(simulation, evidence, own, pairs, len(starts), False, tick)
+            _, what = wanted.setdefault(round(max(0.0, time - start), 6), (max(0.0, time - start), []))
+            what += [(number, time)] if time > 0 or moving else []  # at rest all variants are alike
+    own = [{name: v for name, v in one.items() if name != FILM_START} for one in values] if starts else values
+    moments = [wanted[key] for key in sorted(wanted)]
 
+    def compared(alike: bool) -> list[Block]:
+        parts: list[list[tuple[Tensor, Tensor, Tensor]]] = [[] for _ in starts or [0.0]]
+        runs = states_of(simulation, own, [moment for moment, _ in moments], alike)
+        for number, ((_, what), states) in enumerate(zip(moments, runs, strict=True)):
+            tick(len(values))
+            for part in evidence if what else ():
+                shown = part.shown(states)
+                for block, time in what:
+                    if (frame := part.video.frame_at(time)) is not None:
+                        found, cluster = part.beside(shown, frame)
+                        moment = torch.full_like(cluster, number * MOMENTS // len(moments))
+                        parts[block].append((found, cluster, moment))
+        joined = (zip(*own, strict=True) for own in parts)
+        return [Block(torch.cat(list(r), 1), torch.cat(list(c)), torch.cat(list(m))) for r, c, m in joined]
 
-def _compared(
-    simulation: Simulation,
-    evidence: Sequence[Evidence],
-    values: Sequence[Values],
-    wanted: Sequence[tuple[float, Sequence[tuple[int, float]]]],
-    count: int,
-    careful: bool,
-    tick: Callable[[int], object],
-) -> list[Block]:
-    parts: list[list[tuple[Tensor, Tensor, Tensor]]] = [[] for _ in range(count)]
-    runs = states_of(simulation, values, [moment for moment, _ in wanted], alike=careful)
-    for number, ((_, what), states) in enumerate(zip(wanted, runs, strict=True)):
-        tick(len(values))
-        for part in evidence if what else ():
-            shown = part.shown(states)
-            for block, time in what:
-                if (frame := part.video.frame_at(time)) is not None:
-                    found, cluster = part.beside(shown, frame)
-                    parts[block].append((found, cluster, torch.full_like(cluster, number * MOMENTS // len(wanted))))
-    blocks = []
-    for own in parts:
-        residuals, clusters, moments = zip(*own, strict=True)
-        blocks.append(Block(torch.cat(residuals, 1), torch.cat(clusters), torch.cat(moments)))
-    return blocks
-
-
-def facing(normals: Tensor, points: Tensor, camera: Camera) -> Tensor:
-    """Foreshortening of surfaces with some normals at some points (T, 3) in a camera, shape (T,): 1 if seen face-on."""
-    view = camera.world_to_camera.cpu().double()
-    ray = torch.nn.functional.normalize(points.double() + view[:3, :3].T @ view[:3, 3], dim=-1)
-    return (normals.double() * ray).sum(-1).abs().clamp(min=LEAST_FACING)
+    try:
+        return compared(not starts)
+    except SimulationDiverged:
+        return compared(False)
 
 
 def _patch_of(points: Tensor) -> Tensor:
@@ -207,19 +173,6 @@ def trusted(
     for (number, frame), square in squares.items():
         found[number].trust[frame] = (1 + square / NOISE**2).rsqrt()  # type: ignore[index]
     return found
-
-
-def distrust(evidence: Sequence[Evidence], times: Sequence[float]) -> float:
-    r"""Return what the trust in points adds to the cost of a place: the mean of :math:`-2 \log` of it.
-
-    It is the likelihood of their larger variance: points that count less are no better fit.
-    """
-    found = []
-    for part in evidence:
-        if part.trust is not None:
-            frames = [frame for time in times if (frame := part.video.frame_at(time)) is not None]
-            found.append(-2 * part.trust[frames][part.tracks.seen[frames]].log())
-    return float(torch.cat(found).mean()) if found else 0.0
 
 
 def _pixels(

@@ -25,13 +25,11 @@ from gaussian_swaying._inputs import read_json
 from gaussian_swaying.inverse.evidence import (
     Evidence,
     compare,
-    compare_starts,
-    distrust,
     explained,
     split,
     trusted,
 )
-from gaussian_swaying.inverse.hand import Judged, prepared
+from gaussian_swaying.inverse.hand import prepared
 from gaussian_swaying.inverse.least_squares import (
     Block,
     DivergedError,
@@ -40,7 +38,6 @@ from gaussian_swaying.inverse.least_squares import (
     cost_of,
     linearised,
     solve,
-    step_from,
 )
 from gaussian_swaying.inverse.plan import (
     FILM_START,
@@ -48,25 +45,24 @@ from gaussian_swaying.inverse.plan import (
     apart_by,
     check_apart,
     check_unknowns,
-    directions,
     is_mirrored,
     mirrored_place,
     parse_base,
     read_unknown,
     values_at,
 )
-from gaussian_swaying.inverse.registration import AWAY, first_look
+from gaussian_swaying.inverse.registration import first_look
 from gaussian_swaying.inverse.report import (
     BEFORE,
     PICTURES,
     Fit,
     consequences,
-    predictions,
     write_before,
+    write_films,
     write_page,
     write_results,
 )
-from gaussian_swaying.inverse.tracks import Tracks, beside_rest, match, opencv, still_until, track
+from gaussian_swaying.inverse.tracks import Tracks, match, opencv, still_until, track
 from gaussian_swaying.inverse.variants import check_variants, states_of
 from gaussian_swaying.inverse.videos import Footage, frame_times, read_videos
 from gaussian_swaying.mpm.state import State
@@ -79,8 +75,8 @@ OURS = (PROGRESS, "page.html", "values.csv", "result.json", "scene.yaml", PICTUR
 
 UNSETTLED = "The values have not settled: `iterations` ran out: raise it and continue with --resume."
 
-FOLLOWED = (0.25, 0.5)  # shares of the frames in which points are followed; chaos grows with time
-STEPS = (0.5, 0.5, 0.75, 1.0, 1.0)  # then those in which Gaussians are matched from rendered frames
+FOLLOWED = 0.5  # share of the frames in which points are followed; chaos grows with time
+STEPS = (0.5, 0.5, 0.75, 1.0, 1.0)  # shares in which Gaussians are matched from rendered frames
 STARTS, SEARCHED, COARSE = 3, 0.5, 0.02  # starts, share of the frames, and residuals per picture, of the search
 LONG_STILL = 0.05  # longest time that a film may be still, if the start of its motion is no unknown [s]
 SPREAD = ("wind.speed", "wind.azimuth", "material.E")  # searched although a start was given
@@ -138,7 +134,8 @@ class Course:
 class Problem:
     """The unknowns of a simulation, and the videos from which they are found.
 
-    ``grids`` are the simulation on other grids, ``judged`` what the background says, ``looked`` sentences on cameras.
+    ``grids`` are the simulation on other grids, ``looked`` sentences on cameras, and ``told`` and ``doubts`` what the
+    background says.
     """
 
     def __init__(
@@ -147,14 +144,14 @@ class Problem:
         videos: Sequence[Footage],
         plan: Plan,
         say: Say | None = None,
-        judged: Sequence[Judged] = (),
         grids: Sequence[Simulation] = (),
         looked: Sequence[str] = (),
+        told: Sequence[str] = (),
+        doubts: Sequence[str] = (),
     ) -> None:
         check_unknowns(simulation, plan.unknowns)
         self.simulation, self.videos, self.plan = simulation, list(videos), plan
-        self.say, self.judged = say or Say(False), tuple(judged)
-        self.grids, self.looked = grids, list(looked)
+        self.say, self.grids, self.looked, self.told, self.doubts = say or Say(False), grids, looked, told, doubts
         self.times = frame_times(videos)
         fitted = max(3, round(0.5 * len(self.times)))
         if plan.until is not None:
@@ -244,7 +241,7 @@ class Problem:
 
         def at(places: Tensor) -> Block:
             values = [self.values(place) for place in places]
-            return compare(self.simulation, evidence, values, times, self.moving, self.say.tick)
+            return compare(self.simulation, evidence, values, times, self.moving, tick=self.say.tick)[0]
 
         return at
 
@@ -285,7 +282,7 @@ class Problem:
             starts = [step * k for k in numbers] or [known.low]
         values, scale = [self.values(place) for place in places], COARSE * max(video.size[0] for video in self.videos)
         with self.say.work("search", len(places) * len(times)):
-            found = compare_starts(self.simulation, evidence, values, times, starts, self.say.tick)
+            found = compare(self.simulation, evidence, values, times, self.moving, starts, self.say.tick)
         costs, best = torch.stack([cost_of(block, scale) for block in found]).min(0)
         if known is not None:
             places[:, self.sought[FILM_START]] = torch.tensor([known.share(start) for start in starts]).double()[best]
@@ -298,17 +295,11 @@ class Problem:
         return ends
 
     def best_of(self, places: Sequence[Sequence[float]]) -> list[list[float]]:
-        """Solve from several starts for a short while, and return the best end, and others with nearly its cost.
-
-        Horizons grow, and at each the worse half is left.
-        """
-        ended, costs, left, evidence = [list(place) for place in places], [0.0], len(places), self.evidence()
-        for share in FOLLOWED:
-            times = self._until(share)
-            ended, costs = self._brief(ended[:left], evidence, times)
-            for place, cost in zip(ended, costs, strict=True):
-                self.say(f"start to {times[-1]:.3g} s: cost {cost:.3g}, {self._shown(place)}")
-            left = (left + 1) // 2
+        """Solve from several starts for a short while, and return the best end, and another with nearly its cost."""
+        times = self._until(FOLLOWED)
+        ended, costs = self._brief(places, self.evidence(), times)
+        for place, cost in zip(ended, costs, strict=True):
+            self.say(f"start to {times[-1]:.3g} s: cost {cost:.3g}, {self._shown(place)}")
         return ended[: 1 + sum(cost < 2 * costs[0] for cost in costs[1:2])]
 
     def _brief(
@@ -318,7 +309,7 @@ class Problem:
 
         Without evidence each compares the points of its own first frame, as those of one place speak for that place.
         """
-        found, more = [], []
+        found = []
         for place in places:
             with suppress(DivergedError, *([] if evidence else [ValueError])):  # it may have no such points
                 own, shown = copy(self), evidence
@@ -326,11 +317,10 @@ class Problem:
                     own.begin_at(place)
                     shown = own.trusted(own.evidence(), place)
                 found.append(own.solved(place, shown, times, BRIEF, False))
-                more.append(distrust(shown, times) if evidence is None else 0.0)
         if not found:
             raise DivergedError("Every simulation of a start diverged: narrow the ranges of `unknowns`.")
         scale = min(own.scale for own in found)
-        costs = [float(cost_of(own.block, scale)[0]) + other for own, other in zip(found, more, strict=True)]
+        costs = [float(cost_of(own.block, scale)[0]) for own in found]
         ends: list[list[float]] = []
         kept: list[float] = []
         for cost, end in sorted(zip(costs, (own.place.tolist() for own in found), strict=True)):
@@ -352,7 +342,7 @@ class Problem:
         near = []
         for end, cost in zip(ended, costs, strict=True):
             self.say(f"rival: cost {cost:.5g}, {self._shown(end)}")
-            most = MIRRORED if is_mirrored(model, unknowns, place, end) else RIVAL
+            most = MIRRORED if is_mirrored(model, self.values(place), self.values(end)) else RIVAL
             if cost < most * costs[0] and apart_by(unknowns, end, place) > 2 * SAME:
                 near.append(self.values(end))
         return near
@@ -397,7 +387,7 @@ class Problem:
             self.say(f"search: {self._shown(course.place)}")
             at = torch.tensor(course.place, dtype=torch.float64)
             matrix = linearised(self.residuals(self.evidence(), self.fitted), at).matrix
-            check_apart(directions(matrix, self.plan.unknowns, at), self.plan.unknowns, self.plan.limit, self.say)
+            check_apart(matrix, self.plan.unknowns, at, self.plan.limit)
             course.step = 0
             kept()
         result = self.result(course, self._stepped(course, kept), films)
@@ -426,37 +416,35 @@ class Problem:
     def result(self, course: Course, evidence: Sequence[Evidence], films: Path | None) -> Fit:
         place, values = torch.tensor(course.place, dtype=torch.float64), self.values(course.place)
         normal = linearised(self.residuals(evidence, self.fitted), place)
-        runs = states_of(self.simulation, [values], self.times, alike=False)
-        moved = (self.simulation.painter.deformed(state) for (state,) in runs)
+        worse: dict[str, float] = {}
+        if films:
+            runs = states_of(self.simulation, [values], self.times, alike=False)
+            moved = (self.simulation.painter.deformed(state) for (state,) in runs)
+            worse = write_films(films, self.simulation, self.videos, self.times, len(self.fitted), moved)
         return Fit(
             self.plan.unknowns,
             tuple(course.place),
             normal.covariance() + self.grid_covariance(place, evidence),
-            predictions(self.simulation, self.videos, self.times, len(self.fitted), moved, films),
             course.history,
             course.seconds,
             "" if course.ended else UNSETTLED,
             tuple(self.notes()),
+            worse,
             explained(self.simulation, self.videos, self.tracks, values, self.fitted),
             consequences(self.plan.assumed, values, self.simulation),
-            self.judged,
+            self.told,
             self.others(course.place, course.rivals),
         )
 
     def grid_covariance(self, place: Tensor, evidence: Sequence[Evidence]) -> Tensor:
-        """The covariance that the grid adds at a place, (U, U): how far the minimum of another grid is.
-
-        A linear step, which is often too short, counts where a solve finds none.
-        """
-        found = torch.zeros(2 * (len(place),), dtype=torch.float64)
+        """The covariance that the grid adds at a place, (U, U): how far the minimum of another grid is."""
+        found = torch.zeros(len(place), len(place), dtype=torch.float64)
         for other in self.grids:
             own = [part.on(other) for part in evidence]
             there = copy(self)
             there.simulation = other
             with suppress(DivergedError):
                 end = there.solved(place.tolist(), own, self.fitted, REFINED, True).place
-                if torch.equal(end, place):
-                    end = step_from(linearised(there.residuals(own, self.fitted), place), place)
                 found += torch.outer(end - place, end - place)
         return found
 
@@ -470,24 +458,15 @@ class Problem:
                 "The camera was found from a frame in which the object may move already, so all values may be off: "
                 "give a film that begins at rest."
             )
-        return found + (self.looked or self._notes_on_start())
-
-    def _notes_on_start(self) -> list[str]:
-        if self.begins is not None:
-            return []
-        still = min(still_until(self.simulation, v, own) for v, own in zip(self.videos, self.tracks, strict=True))
+        found += [*self.doubts, *self.looked]
+        pairs = [] if self.looked or self.begins is not None else zip(self.videos, self.tracks, strict=True)
+        still = min((still_until(self.simulation, video, own) for video, own in pairs), default=0.0)
         if still >= LONG_STILL:
-            return [
+            found.append(
                 f"Nothing moves in the first {still:.2g} s of the film, but the simulation starts at once: add "
                 f"{FILM_START}: {{range: [0, {math.ceil(20 * still) / 10:g}]}} to `unknowns`, or cut the film."
-            ]
-        beside = max(beside_rest(self.simulation, video, self.plan.tracks) for video in self.videos)
-        if beside > AWAY:
-            return [
-                f"The first frame is {beside:.2g} pixels away from the splat at rest, and moves: the film begins in "
-                f"motion. Add {FILM_START}: {{range: [-1, 0]}} to `unknowns`, or give a film that begins at rest."
-            ]
-        return []
+            )
+        return found
 
     def _shown(self, place: Sequence[float]) -> str:
         return ", ".join(f"{name} {value:.5g}" for name, value in self.values(place).items())
@@ -558,23 +537,22 @@ def _ready(plan: Plan, parser: Any, settings: Any, device: str, progress: bool) 
     own.camera = own.cameras = None  # the videos have their own
     simulation, say = Simulation.from_settings(parser, own), Say(progress)
     videos = read_videos(list(plan.videos), plan.cameras, simulation.scene.size, simulation.scene.model.origin)
-    moving = any(u.name == FILM_START and u.low < 0 for u in plan.unknowns)
-    looked = [told for video in videos for told in first_look(simulation, video, moving)]
+    earliest = next((u.low for u in plan.unknowns if u.name == FILM_START), None)
+    looked = [told for video in videos for told in first_look(simulation, video, earliest)]
     with say.work("the camera of each frame", sum(len(video.times) for video in videos)):
-        videos, judged = prepared(simulation, videos, plan.hand_held, plan.also_moves, say, say.tick)
+        videos, told, doubts = prepared(simulation, videos, plan.hand_held, plan.also_moves, say.tick)
+    for line in told:
+        say(line)
+    return Problem(simulation, videos, plan, say, _other_grids(simulation, say), looked, told, doubts)
 
-    return Problem(simulation, videos, plan, say, judged, _other_grids(parser, own, say), looked)
 
-
-def _other_grids(parser: Any, settings: Any, say: Say) -> list[Simulation]:
+def _other_grids(simulation: Simulation, say: Say) -> list[Simulation]:
     found = []
     for ratio in GRIDS:
-        given = settings.clone()
-        given.solver.dx = ratio * given.solver.dx
         try:
             with warnings.catch_warnings():  # of an object of few cells
                 warnings.simplefilter("ignore")
-                found.append(Simulation.from_settings(parser, given))
+                found.append(simulation.on_grid(ratio))
         except ValueError as error:
             say(f"cells {ratio:g} times as large, to know the error of the grid, are not possible: {error}")
     return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -94,24 +94,22 @@ def stands_still(video: Footage) -> bool:
 def follow_camera(
     video: Footage, background: Background, tick: Callable[[int], object] = int
 ) -> tuple[Footage, tuple[int, ...], float]:
-    """The video with the camera of each frame, from that of the first frame, or rough ones of all.
+    """The video with the camera of each frame, from that of the first frame.
 
     Frames that show too little of the background are listed, and have a camera between those of their neighbours. The
     number is the median distance of points that agree [pixels].
     """
     found: list[Registration | None] = []
-    last: Camera | None = None
-    for k, given in enumerate(video.cameras):
-        camera = given if last is None else _carried(given, video.cameras[k - 1], last)
+    camera = video.cameras[0]
+    for image in video.images:
         seen = None
-        for _ in range(FIRST if last is None else DRAWN):
+        for _ in range(DRAWN if found else FIRST):
             picture, still = background.draw(camera)
-            seen = refine(video.images[k], picture, camera, still)
+            seen = refine(image, picture, camera, still)
             if seen is None or seen.agreeing < AGREE * seen.matches:
                 seen = None
                 break
             camera = seen.camera
-        last = camera
         found.append(seen)
         tick(1)
     unseen = tuple(k for k, camera in enumerate(found) if camera is None)
@@ -139,16 +137,10 @@ def _filled(video: Footage, found: Sequence[Registration | None]) -> tuple[Camer
     return tuple(replace(known[0][1], world_to_camera=view) for view in views)
 
 
-def _carried(given: Camera, before: Camera, found: Camera) -> Camera:
-    """A camera moved from the last frame's, which was found, as the given ones move; still if they are."""
-    there, then, now = (c.world_to_camera.double().cpu() for c in (found, before, given))
-    return replace(given, world_to_camera=now @ torch.linalg.inv(then) @ there, intrinsics=found.intrinsics)
-
-
-def gains(video: Footage, background: Background) -> tuple[Tensor, tuple[int, ...]] | None:
+def gains(video: Footage, background: Background) -> Tensor | None:
     """Brightness of each frame over that of the splat in red, green and blue, float64, shape (F, 3).
 
-    Frames that show too little of the background have those of their neighbours, and are listed; None if all do.
+    Frames that show too little of the background have those of their neighbours; None if all do.
     """
     found: list[Tensor | None] = []
     drawn: tuple[Camera, Tensor, Tensor] | None = None
@@ -162,7 +154,7 @@ def gains(video: Footage, background: Background) -> tuple[Tensor, tuple[int, ..
         return None
     rows = np.stack([one.numpy() for one in found if one is not None])
     filled = [np.interp(video.times, [video.times[k] for k in known], own) for own in rows.T]
-    return torch.from_numpy(np.stack(filled, 1)), tuple(k for k, one in enumerate(found) if one is None)
+    return torch.from_numpy(np.stack(filled, 1))
 
 
 def gain_of(image: Tensor, picture: Tensor, still: Tensor) -> Tensor | None:
@@ -189,53 +181,17 @@ def _averaged(picture: Tensor) -> Tensor:
     return torch.nn.functional.avg_pool2d(picture.permute(2, 0, 1)[None], BLOCK)[0].flatten(1).T
 
 
-@dataclass
-class Judged:
-    """What the background says of the film of a camera."""
-
-    camera: str
-    frames: int
-    moved: float = 0.0  # pixels
-    hand_held: bool = False
-    residual: float = 0.0  # pixels
-    unseen: int = 0  # frames that show too little of it
-    gains: Sequence[Sequence[float]] = ()  # smallest and largest of red, green and blue
-
-    def sentences(self) -> list[str]:
-        found = []
-        if self.hand_held:
-            found.append(
-                f"camera {self.camera}: held in a hand; its background goes {self.moved:.3g} pixels. The camera of "
-                f"each frame was found, {self.residual:.2f} pixels off"
-                + (f"; {self.unseen} of {self.frames} frames have that of their neighbours." if self.unseen else ".")
-            )
-        if self.gains:
-            rows = zip(("red", "green", "blue"), *self.gains, strict=True)
-            told = ", ".join(f"{name} {low:.2f} to {high:.2f}" for name, low, high in rows)
-            found.append(f"camera {self.camera}: as bright as the splat now; the frames were divided by {told}.")
-        return found
-
-    def doubts(self) -> list[str]:
-        if self.unseen <= MANY * self.frames:
-            return []
-        return [
-            f"camera {self.camera}: {self.unseen} of {self.frames} frames show too little of what stands still, and "
-            "have the camera of their neighbours: film more of it, or from a tripod."
-        ]
-
-
 def prepared(
     simulation: Simulation,
     videos: Sequence[Footage],
     hand_held: bool | None = None,
     also_moves: Sequence[str] = (),
-    say: Callable[[str], None] = lambda line: None,
     tick: Callable[[int], object] = int,
-) -> tuple[list[Footage], list[Judged]]:
+) -> tuple[list[Footage], list[str], list[str]]:
     """Find the camera of each frame of films from a hand, and take drifts of exposure and white balance off all films.
 
     Returns:
-        The films, and what the background says of each; nothing if the splat has none.
+        The films, and sentences: what the background says of them, if the splat has one, and what speaks against them.
     """
     background = Background(simulation, also_moves)
     if not background.exists:
@@ -244,20 +200,25 @@ def prepared(
                 "`hand_held` needs something that stands still in the splat, but all of it moves: stand the camera on "
                 "a tripod, or have something still and textured, too, in the film and in the splat."
             )
-        return list(videos), []
-    found, judged = [], []
+        return list(videos), [], []
+    found, told, doubts = [], list[str](), list[str]()
     for video in videos:
-        one = Judged(video.name, len(video.times))
-        if hand_held is not False and stands_still(video):
-            one.moved = moves_by(video, background)
-        if hand_held or (one.moved > STILL and hand_held is None):
-            video, unseen, one.residual = follow_camera(video, background, tick)
-            one.hand_held, one.unseen = True, len(unseen)
+        moved = moves_by(video, background) if hand_held is not False and stands_still(video) else 0.0
+        if hand_held or (moved > STILL and hand_held is None):
+            video, unseen, residual = follow_camera(video, background, tick)
+            told.append(
+                f"camera {video.name}: held in a hand; its background goes {moved:.3g} pixels. The camera of each "
+                f"frame was found, {residual:.2f} pixels off."
+            )
+            if len(unseen) > MANY * len(video.times):
+                doubts.append(
+                    f"camera {video.name}: {len(unseen)} of {len(video.times)} frames show too little of what stands "
+                    "still, and have the camera of their neighbours: film more of it, or from a tripod."
+                )
         if (bright := gains(video, background)) is not None:
-            video = replace(video, images=with_gains(video.images, bright[0]))
-            one.gains = bright[0].amin(0).tolist(), bright[0].amax(0).tolist()
-        for line in one.sentences():
-            say(line)
+            video = replace(video, images=with_gains(video.images, bright))
+            rows = zip(("red", "green", "blue"), bright.amin(0).tolist(), bright.amax(0).tolist(), strict=True)
+            divided = ", ".join(f"{name} {low:.2f} to {high:.2f}" for name, low, high in rows)
+            told.append(f"camera {video.name}: as bright as the splat now; the frames were divided by {divided}.")
         found.append(video)
-        judged.append(one)
-    return found, judged
+    return found, told, doubts

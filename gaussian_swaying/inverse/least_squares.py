@@ -173,9 +173,3 @@ def linearised(residuals: Residuals, place: Tensor, scale: Callable[[Block], flo
     moment = torch.zeros_like(block.cluster) if block.moment is None else block.moment
     scores = [own.new_zeros(1 + int(one.max()), unknowns).index_add(0, one, own) for one in (block.cluster, moment)]
     return Normal(own.sum(0), flat @ flat.mT, (scores[0], scores[1]))
-
-
-def step_from(normal: Normal, place: Tensor) -> Tensor:
-    """Return the end of a Gauss-Newton step within the ranges, of :data:`REACH` at most."""
-    step = -torch.linalg.pinv(normal.matrix, hermitian=True) @ normal.gradient
-    return (place + step.clamp(-REACH, REACH)).clamp(0.0, 1.0)

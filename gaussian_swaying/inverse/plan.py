@@ -22,7 +22,7 @@ from gaussian_swaying.config.gone import refuse_gone
 from gaussian_swaying.config.parser import check_settings, import_forces, option
 from gaussian_swaying.simulation.model import Model, find, names
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.wind.field import WindField, flow_of
+from gaussian_swaying.wind.field import WindField
 
 if TYPE_CHECKING:
     from jsonargparse import ArgumentParser, Namespace
@@ -34,7 +34,6 @@ SCALE, FILM_START = "scene.metres_per_unit", "film.start"  # start of the motion
 FLAT = 0.8  # mean square of the area that faces one way, from which the wind may be mirrored
 TURN, MIRROR = 5.0, 20.0  # least angle between wind and mirror image, and largest to another end [degrees]
 LARGE = 0.25  # share of the largest part of a direction below which an unknown is not named
-Direction = tuple[float, list[float], str]  # how strong, its shares of the unknowns, and in words
 OF_FILM = {FILM_START: Live("s"), SCALE: Live("m", scale="log")}  # unknowns that are no numbers of the simulation
 LISTS = ("base", "videos", "cameras", "assumed", "also_moves")
 ASSUMED = ("length", "mass", "camera")
@@ -104,12 +103,6 @@ def known_unknown(name: str) -> Live | None:
     return OF_FILM.get(name) or find(name)
 
 
-def default_scale(name: str, low: float) -> str:
-    """``log`` for positive sizes, ``linear`` for angles, Poisson's ratio and ranges that reach zero."""
-    known = known_unknown(name)
-    return "log" if low > 0 and known and known.scale == "log" else "linear"
-
-
 def values_at(unknowns: Sequence[Unknown], place: Iterable[float]) -> dict[str, float]:
     """Values of unknowns at a place, given as shares of their ranges."""
     return {u.name: u.value(float(share)) for u, share in zip(unknowns, place, strict=True)}
@@ -168,54 +161,34 @@ def at_scale(model: Model, metres_per_unit: float) -> Model:
     return replace(found, wind=changed(wind, flows=wind.flows / ratio))
 
 
-def directions(matrix: Tensor, unknowns: Sequence[Unknown], place: Tensor) -> list[Direction]:
-    """The principal directions of the sensitivities J^T W J (U, U) at a place (U,), the best known first."""
-    values, vectors = torch.linalg.eigh(matrix)
-    found = []
-    for value, parts in zip(values.flip(0).tolist(), vectors.flip(1).mT.tolist(), strict=True):
-        lead = max(range(len(parts)), key=lambda k: abs(parts[k]))
-        unknown, share = unknowns[lead], float(place[lead])
-        own = abs(unknown.value(share))
-        # how far along the direction until the largest part has changed by a tenth of its value, or of its range
-        far = 0.1 * own / abs(unknown.slope(share)) if own and unknown.scale == "log" else 0.1
-        told = changes([far / parts[lead] * part for part in parts], unknowns, place)
-        found.append((math.sqrt(max(value, 0.0)), parts, told))
-    return found
+def check_apart(matrix: Tensor, unknowns: Sequence[Unknown], place: Tensor, limit: float) -> None:
+    """Raise ValueError if a film cannot tell unknowns apart at a place (U,), from the sensitivities J^T W J (U, U).
 
-
-def check_apart(
-    found: Sequence[Direction],
-    unknowns: Sequence[Unknown],
-    limit: float,
-    say: Callable[[str], object] = lambda line: None,
-) -> None:
-    """Say the directions, and raise ValueError if the largest singular value is over ``limit`` times the smallest."""
-    for strength, _, told in found:
-        say(f"sensitivity {strength:9.3g}: {told}")
-    (best, *_), (worst, parts, sentence) = found[0], found[-1]
-    condition = best / max(worst, 1e-300)
+    That is where the largest singular value is over ``limit`` times the smallest.
+    """
+    squares, vectors = torch.linalg.eigh(matrix)
+    condition = math.sqrt(max(float(squares[-1]), 0.0) / max(float(squares[0]), 1e-300))
     if len(unknowns) < 2 or condition <= limit:
         return
-    largest, told = max(map(abs, parts)), f"(condition {condition:.3g}, limit {limit:g})"
-    names = [f"`{u.name}`" for u, part in zip(unknowns, parts, strict=True) if abs(part) > LARGE * largest]
-    if len(names) == 1:
-        raise ValueError(f"The video does not tell {names[0]} {told}: put it into `known`, or raise `limit`.")
+    told, weakest, words = f"(condition {condition:.3g}, limit {limit:g})", vectors[:, 0].tolist(), {}
+    lead = max(range(len(unknowns)), key=lambda k: abs(weakest[k]))
+    first, share = unknowns[lead], float(place[lead])
+    # how far until the largest part has changed by a tenth of its value, or of its range
+    far = 0.1 * abs(first.value(share) / first.slope(share)) if first.scale == "log" else 0.1
+    for u, part, share in zip(unknowns, weakest, place.tolist(), strict=True):
+        if abs(part) > LARGE * abs(weakest[lead]):
+            change = far * part / weakest[lead] * u.slope(share)
+            amount = (
+                f"{abs(change / u.value(share)):.0%}" if u.scale == "log" else f"{abs(change):.2g} {u.unit}".strip()
+            )
+            words[f"`{u.name}`"] = f"{'raising' if change > 0 else 'lowering'} {u.name} by {amount}"
+    *names, last = words
+    if not names:
+        raise ValueError(f"The video does not tell {last} {told}: put it into `known`, or raise `limit`.")
     raise ValueError(
-        f"The video cannot tell {', '.join(names[:-1])} and {names[-1]} apart: {sentence} changes nothing that "
-        f"is seen {told}. Put one of them into `known`, or raise `limit`."
+        f"The video cannot tell {', '.join(names)} and {last} apart: {' and '.join(words.values())} changes nothing "
+        f"that is seen {told}. Put one of them into `known`, or raise `limit`."
     )
-
-
-def changes(step: Sequence[float], unknowns: Sequence[Unknown], place: Tensor) -> str:
-    """A step, in shares of the ranges, in words: ``raising wind.speed by 10% and lowering material.E by 20%``."""
-    largest, words = max(map(abs, step)), []
-    for u, part, share in zip(unknowns, step, place.tolist(), strict=True):
-        if abs(part) <= LARGE * largest:
-            continue
-        change, own = part * u.slope(share), abs(u.value(share))
-        amount = f"{abs(change) / own:.0%}" if u.scale == "log" and own else f"{abs(change):.2g} {u.unit}".strip()
-        words.append(f"{'raising' if change > 0 else 'lowering'} {u.name} by {amount}")
-    return " and ".join(words) if len(words) < 3 else ", ".join(words[:-1]) + " and " + words[-1]
 
 
 def apart_by(unknowns: Sequence[Unknown], one: Sequence[float], other: Sequence[float]) -> float:
@@ -236,15 +209,16 @@ def turn(angle: float) -> float:
 def mirrored_place(model: Model, unknowns: Sequence[Unknown], place: Sequence[float]) -> list[list[float]]:
     """The place with the mirrored wind, as shares of the ranges; none if there is none within them."""
     for k, unknown in enumerate(unknowns):
-        if unknown.name == "wind.azimuth" and (azimuth := mirrored(model, values_at(unknowns, place))) is not None:
+        azimuth = mirrored(model, unknown.value(place[k])) if unknown.name == "wind.azimuth" else None
+        if azimuth is not None:
             middle = 0.5 * (unknown.low + unknown.high)
             share = unknown.share(middle + turn(azimuth - middle))
             return [[*place[:k], share, *place[k + 1 :]]] if 0 <= share <= 1 else []
     return []
 
 
-def mirrored(model: Model, values: Values) -> float | None:
-    r"""Return the azimuth of the wind mirrored at the normal of a sheet at rest [degrees]; None if nothing is flat.
+def mirrored(model: Model, azimuth: float) -> float | None:
+    r"""Return the azimuth of a wind mirrored at the normal of a sheet at rest [degrees]; None if nothing is flat.
 
     The pressure on a sheet with normal n depends on :math:`w \cdot n` and the speed, which the mirror image
     :math:`2 (w \cdot n) n - w` leaves. Level with the ground, that is the azimuth :math:`2 \beta - \alpha`, with the
@@ -257,17 +231,14 @@ def mirrored(model: Model, values: Values) -> float | None:
     if not float(shares[-1]) >= FLAT:
         return None
     facing = math.degrees(math.atan2(float(axes[1, -1]), float(axes[0, -1])))
-    x, y, _ = flow_of((1.0, 0.0, 0.0), values)
-    azimuth = math.degrees(math.atan2(y, x))
     other = 2 * facing - azimuth
     return other if abs(turn(other - azimuth)) >= TURN else None
 
 
-def is_mirrored(model: Model, unknowns: Sequence[Unknown], place: Sequence[float], end: Sequence[float]) -> bool:
-    """True if the wind at the end of another start is about the mirror image of that at a place, both as shares."""
-    values, there = values_at(unknowns, place), values_at(unknowns, end)
-    other = mirrored(model, values) if "wind.azimuth" in values else None
-    return other is not None and abs(turn(there["wind.azimuth"] - other)) < MIRROR
+def is_mirrored(model: Model, values: Values, end: Values) -> bool:
+    """True if the wind at the end of another start is about the mirror image of that of some values."""
+    other = mirrored(model, values["wind.azimuth"]) if "wind.azimuth" in values else None
+    return other is not None and abs(turn(end["wind.azimuth"] - other)) < MIRROR
 
 
 @dataclass(frozen=True)
@@ -347,7 +318,8 @@ def read_unknown(name: str, given: Any) -> Unknown:
     if start is not None and not is_number(start):
         raise ValueError(f"Expected `{where}.start` to be a number, but got {start!r}.")
     low, high = map(float, ends)
-    scale = str(further.get("scale") or default_scale(str(name), low))
+    known = known_unknown(str(name))
+    scale = str(further.get("scale") or ("log" if low > 0 and known and known.scale == "log" else "linear"))
     return Unknown(str(name), low, high, scale, None if start is None else float(start))
 
 

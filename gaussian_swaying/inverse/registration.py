@@ -249,24 +249,29 @@ def _seen_from(
     return Registration(seen, int(known.sum()), len(world), float(np.sqrt((off**2).sum(1).mean())))
 
 
-def shown_in(picture: RenderOutput, frame: Tensor) -> tuple[float, float]:
-    """Share of the points of the splat's picture that are alike in a frame (H, W, 3), and how far they are [pixels]."""
+def shown_in(picture: RenderOutput, frame: Tensor) -> tuple[float, float, float]:
+    """Share of the points of the splat's picture that are alike in a frame (H, W, 3).
+
+    And how far half and three quarters of them are at most [pixels].
+    """
     drawn, real = grey_of(picture.color), grey_of(frame)
     mask = (picture.alpha[..., 0].detach().cpu().numpy() > SOLID).astype(np.uint8)
     start = corners(drawn, 300, 0.01, 5, mask)
     if not len(start):
-        return 0.0, math.inf
+        return 0.0, math.inf, math.inf
     pair = np.stack([drawn, real])
     place, seen = follow(pair, start)
     good = torch.from_numpy(seen[1]) & (alike(torch.from_numpy(pair)[..., None], torch.from_numpy(place)) > ALIKE)
     off = torch.from_numpy(place[1] - place[0])[good].norm(dim=-1)
-    return float(good.double().mean()), float(off.median()) if len(off) else math.inf
+    half, most = off.quantile(torch.tensor([0.5, 0.75]).to(off)).tolist() if len(off) else (math.inf, math.inf)
+    return float(good.double().mean()), half, most
 
 
-def first_look(simulation: Simulation, video: Footage, moving: bool) -> list[str]:
-    """A sentence if the camera of a video is not where it is said to be; ValueError if it does not show the splat.
+def first_look(simulation: Simulation, video: Footage, earliest: float | None) -> list[str]:
+    """A sentence if the camera of a video is not where it is said to be, or if the video begins in motion.
 
-    A film that begins in motion may look like anything in its first frame.
+    ``earliest`` is the low end of the range of ``film.start`` [s], None if that is not sought. A film that may begin in
+    motion may look like anything in its first frame; ValueError if any other does not show the splat.
     """
     from scipy.spatial.transform import Rotation
 
@@ -275,16 +280,20 @@ def first_look(simulation: Simulation, video: Footage, moving: bool) -> list[str
     def draw(camera: Camera) -> RenderOutput:
         return picture_of(simulation, rest, camera.to(dtype=torch.float32))
 
-    share, off = shown_in(draw(given), frame)
+    share, off, most = shown_in(draw(given), frame)
     other = None if share >= FOUND and off <= AWAY else _elsewhere(draw, frame, given, share)
-    if other is None and share < FOUND and not moving:
+    if other is None and share < FOUND and (earliest is None or earliest >= 0):
         raise ValueError(
             f"The first frame of camera {video.name} does not show the splat where its camera looks: give a film of "
             "this splat, or find its camera with `gaussian-swaying camera FILM SPLAT` (its places may be in another "
             f"unit); if it begins in motion, add {FILM_START}: {{range: [-1, 0]}} to `unknowns`."
         )
     if other is None:
-        return []
+        told = (
+            f"The first frame of camera {video.name} is {most:.2g} pixels away from the splat at rest: the film begins "
+            f"in motion. Add {FILM_START}: {{range: [-1, 0]}} to `unknowns`, or give a film that begins at rest."
+        )
+        return [told] if earliest is None and most > AWAY else []
     middle = rest.means.double().cpu().mean(0)
     near, far = ((camera.position.double().cpu() - middle).norm() for camera in (other, given))
     larger = float(far / near)
@@ -305,5 +314,5 @@ def _elsewhere(draw: Draw, frame: Tensor, given: Camera, share: float) -> Camera
         found = find_camera(draw, frame, [given]).camera
     except ValueError:
         return None
-    better, off = shown_in(draw(found), frame)
+    better, off, _ = shown_in(draw(found), frame)
     return found if better >= max(FOUND, share) and off < 0.5 * AWAY else None

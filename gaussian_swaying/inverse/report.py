@@ -6,7 +6,7 @@ import html
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -18,7 +18,6 @@ from torch import Tensor
 from gaussian_swaying._files import write_json, write_table, write_text
 from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.gaussians.model import DeformedGaussians
-from gaussian_swaying.inverse.hand import Judged
 from gaussian_swaying.inverse.plan import SCALE, Unknown, of_simulation, values_at
 from gaussian_swaying.inverse.tracks import Tracks, opencv, picture_of
 from gaussian_swaying.inverse.videos import Footage
@@ -41,41 +40,31 @@ CHECK = "Raise `search`, widen the ranges, check the base and `known`"
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
-    """PSNR of a camera's frames that were fitted, of those that were predicted (NaN if none), and at rest [dB]."""
-
-    camera: str
-    fitted: float
-    predicted: float
-    rest: float
-
-
-@dataclass(frozen=True, eq=False)
 class Fit:
     """The result of a fit.
 
     Attributes:
         covariance: Covariance of the places, as shares of the ranges, shape (U, U).
-        shown: Comparison with the video of each camera.
         unsettled: Why the values are not a local minimum, and a remedy; empty if they are one.
         notes: What the videos say against the plan.
+        worse: How much the fitted frames of each camera are worse than its frame at rest: loss of PSNR [dB].
         followed: For each camera the share of the motion of its held-out tracks that is explained, 0 to 1.
         assumed: What the values rest on that nobody measured.
-        judged: What the background says of each video.
+        background: What the background says of the videos, in words.
         rivals: Other values that fit nearly as well.
     """
 
     unknowns: Sequence[Unknown]
     place: tuple[float, ...]
     covariance: Tensor
-    shown: Sequence[Shown]
     history: Sequence[Mapping[str, Any]]
     seconds: float
     unsettled: str = ""
     notes: Sequence[str] = ()
+    worse: Mapping[str, float] = field(default_factory=dict)
     followed: Mapping[str, float] = field(default_factory=dict)
     assumed: Sequence[str] = ()
-    judged: Sequence[Judged] = ()
+    background: Sequence[str] = ()
     rivals: Sequence[Mapping[str, float]] = ()
 
     @property
@@ -102,15 +91,10 @@ class Fit:
     def at_an_end(self) -> list[str]:
         return [u.name for u, p in zip(self.unknowns, self.place, strict=True) if p < 1e-3 or p > 1 - 1e-3]
 
-    @property
-    def astray(self) -> list[str]:
-        """Names of cameras whose fitted frames the simulation does not follow: much worse than the one at rest."""
-        return [one.camera for one in self.shown if one.fitted < one.rest - ASTRAY]
-
     def doubts(self) -> tuple[list[str], list[str]]:
         """Reasons for which the fit has failed, and for which it is doubtful, as sentences with a remedy."""
         failed: list[str] = []
-        doubtful = [*self.notes, *(doubt for one in self.judged for doubt in one.doubts())]
+        doubtful = list(self.notes)
         for rival in self.rivals:
             told = ", ".join(f"{name} {value:.4g}" for name, value in rival.items())
             doubtful.append(
@@ -122,11 +106,11 @@ class Fit:
                     f"camera {name}: the simulation explains {share:.0%} of the motion of its tracks. {CHECK}, "
                     "or film from a side where the motion is across the picture."
                 )
-        for one in self.shown:
-            if one.camera in self.astray and self.followed.get(one.camera, 0.0) < FOLLOWED:
+        for name, loss in self.worse.items():
+            if loss > ASTRAY and self.followed.get(name, 0.0) < FOLLOWED:
                 failed.append(
-                    f"camera {one.camera} is not followed: its fitted frames are {one.rest - one.fitted:.0f} dB worse "
-                    f"than the one at rest, so the values may be wrong. {CHECK}, or fit a shorter part (`until`)."
+                    f"camera {name} is not followed: its fitted frames are {loss:.0f} dB worse than the one at rest, "
+                    f"so the values may be wrong. {CHECK}, or fit a shorter part (`until`)."
                 )
         doubtful += [self.unsettled] if self.unsettled else []
         doubtful += [
@@ -156,52 +140,44 @@ class Fit:
         lines = [f"{'':<28}{'value':>12}{'error':>12}"]
         for row in self.rows():
             lines.append(f"{row['name']:<28}{row['value']:>12.5g}{row['standard_error']:>12.2g} {row['unit']}".rstrip())
-        for one in self.shown:
-            told = "" if math.isnan(one.predicted) else f", predicted frames {one.predicted:.2f} dB"
-            lines.append(f"camera {one.camera}: fitted frames {one.fitted:.2f} dB{told}")
-        lines += [sentence for one in self.judged for sentence in one.sentences()]
+        lines += self.background
         failed, doubtful = self.doubts()
         said = {"good": "This fit is good.", "doubtful": "This fit is doubtful:", "failed": "This fit has failed:"}
         lines += [said[self.verdict], *failed, *doubtful]
         return "\n".join([*lines, *(["Not measured:", *self.assumed] if self.assumed else [])])
 
 
-def predictions(
+def write_films(
+    folder: Path,
     simulation: Simulation,
     videos: Sequence[Footage],
     times: Sequence[float],
     fitted: int,
     moved: Iterable[DeformedGaussians],
-    films: Path | None = None,
-) -> list[Shown]:
-    """Compare all Gaussians at each time with whole videos, of which so many times were fitted.
+) -> dict[str, float]:
+    """Write ``film_CAMERA.mp4``, the whole video beside all Gaussians at each time, of which so many were fitted.
 
-    ``film_CAMERA.mp4``, the video beside the fit, is written into the folder ``films``.
+    Returns:
+        For each camera the loss of PSNR of the fitted frames against the first one [dB].
     """
-    squares: list[tuple[list[float], list[float]]] = [([], []) for _ in videos]
-    encoders = list[VideoEncoder]()
+    encoders, errors = list[VideoEncoder](), {video.name: list[float]() for video in videos}
+    folder.mkdir(exist_ok=True)
     with ExitStack() as left:
-        for video in videos if films else ():
-            films.mkdir(exist_ok=True)  # type: ignore[union-attr]
+        for video in videos:
             rate = (len(video.times) - 1) / (video.times[-1] - video.times[0])
-            encoders.append(VideoEncoder(films / f"film_{video.name}.mp4", rate))  # type: ignore[operator]
+            encoders.append(VideoEncoder(folder / f"film_{video.name}.mp4", rate))
             left.callback(encoders[-1].abort)
         for k, (time, gaussians) in enumerate(zip(times, moved, strict=True)):
-            for number, video in enumerate(videos):
-                if (frame := video.frame_at(time)) is None:
-                    continue
-                drawn = picture_of(simulation, gaussians, video.cameras[frame]).color
-                shown, real = drawn.clamp(0, 1).float().cpu(), video.images[frame].float() / 255
-                squares[number][k >= fitted].append(float((shown - real).square().mean()))
-                if encoders:
-                    title = "predicted" if k >= fitted else "fitted"
-                    encoders[number].write(titled([(f"film, {time:.2f} s", real), (title, shown)]))
+            title = "predicted" if k >= fitted else "fitted"
+            for encoder, video in zip(encoders, videos, strict=True):
+                if (frame := video.frame_at(time)) is not None:
+                    shown = picture_of(simulation, gaussians, video.cameras[frame]).color.clamp(0, 1).float().cpu()
+                    real = video.images[frame].float() / 255
+                    encoder.write(titled([(f"film, {time:.2f} s", real), (title, shown)]))
+                    errors[video.name] += [float((shown - real).square().mean())] if k < fitted else []
         for encoder in encoders:
             encoder.finish()
-    return [
-        Shown(video.name, _psnr(before), _psnr(after), _psnr(before[:1]))
-        for video, (before, after) in zip(videos, squares, strict=True)
-    ]
+    return {name: 10 * math.log10(max(sum(e) / len(e), 1e-12) / max(e[0], 1e-12)) for name, e in errors.items()}
 
 
 def write_results(
@@ -213,18 +189,11 @@ def write_results(
     told = {
         "values": result.rows(),
         "covariance_of_shares": result.covariance.tolist(),
-        "cameras": [
-            {name if name == "camera" else f"psnr_{name}_db": value for name, value in vars(one).items()}
-            for one in result.shown
-        ],
         "verdict": result.verdict,
         "why": [*failed, *doubtful],
         "motion_explained": result.followed,
         "assumed": result.assumed,
-        "background": [asdict(one) for one in result.judged],
-        "not_settled": result.unsettled,
-        "not_followed": result.astray,
-        "not_determined": result.vague,
+        "background": result.background,
         "history": result.history,
         "seconds": result.seconds,
     }
@@ -270,21 +239,14 @@ def consequences(assumed: Sequence[str], values: Mapping[str, float], simulation
     return found
 
 
-def _psnr(squares: Sequence[float]) -> float:
-    """PSNR of mean squares [dB], of their mean; NaN for none."""
-    mean = sum(squares) / len(squares) if squares else math.nan
-    return -10 * math.log10(mean) if mean != 0 else math.inf
-
-
 def write_page(folder: Path, result: Fit) -> None:
     """Write ``page.html``, named after the last two folders of its path, with the films and pictures of the fit."""
     name = html.escape("/".join(folder.resolve().parts[-2:]))
-    shown = "".join(
-        f'<h3>Camera {html.escape(one.camera)}</h3><video src="{PICTURES}/film_{quote(one.camera)}.mp4" autoplay loop '
-        f'muted controls></video><img src="{BEFORE}/rest_{quote(one.camera)}.png" alt="the scene at rest">'
-        f'<img src="{BEFORE}/tracks_{quote(one.camera)}.png" alt="points that are followed">'
-        for one in result.shown
-    )
+    shown = ""
+    for path in [*sorted((folder / PICTURES).glob("*.mp4")), *sorted((folder / BEFORE).glob("*.png"))]:
+        source = f'src="{quote(path.relative_to(folder).as_posix())}"'
+        media = f"<video {source} autoplay loop muted controls></video>" if path.suffix == ".mp4" else f"<img {source}>"
+        shown += f"<h3>{html.escape(path.stem)}</h3>{media}"
     head = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{name}</title>'
     style = "<style>video, img { max-width: 100%; max-height: 85vh } pre { white-space: pre-wrap }</style>"
     slow = "<script>for (const film of document.querySelectorAll('video')) film.playbackRate = 0.5;</script>"

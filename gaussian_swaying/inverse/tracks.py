@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -98,30 +98,14 @@ def in_bytes(picture: RenderOutput) -> Tensor:
     return (picture.color.clamp(0, 1) * 255).round().to(torch.uint8).cpu()
 
 
-def beside_rest(simulation: Simulation, video: Footage, most: int = 400) -> float:
-    """Distance between the splat at rest and the first frame of a video [pixels], of the upper quarter of points.
-
-    A shift of all points alike is a fault of the camera, and left out.
-    """
-    rest, moving = simulation.scene.rest(), simulation.scene.moving
-    found = track(simulation, replace(video, images=video.images[:1]), most, rest)
-    means = rest.means[moving[found.index.to(moving.device)]].cpu()
-    off = (found.position[0] - project(means, video.cameras[0])[0])[found.seen[0]]
-    return float((off - off.median(0).values).norm(dim=-1).quantile(0.75)) if len(off) else 0.0
-
-
 def alike(images: Tensor, position: Tensor) -> Tensor:
     """Correlation of the surroundings of points in two pictures (2, H, W, 3) at positions (2, T, 2), shape (T,)."""
-    side = window_of(images.shape[2], images.shape[1])
-    planes = images.double().mean(-1)[:, None]
-    height, width = planes.shape[-2:]
-    reach = torch.arange(side, dtype=torch.float64) - side // 2
-    row, column = torch.meshgrid(reach, reach, indexing="ij")
-    places = position[:, :, None] + torch.stack([column, row], -1).reshape(1, 1, -1, 2)
-    grid = 2 * places / torch.tensor([width, height], dtype=torch.float64) - 1
-    found = torch.nn.functional.grid_sample(planes, grid, padding_mode="border", align_corners=False)[:, 0]
-    found = found - found.mean(-1, keepdim=True)
-    return (found[0] * found[1]).sum(-1) / (found[0].norm(dim=-1) * found[1].norm(dim=-1)).clamp(min=1e-9)
+    cv2, side = opencv(), window_of(images.shape[2], images.shape[1])
+    found = []
+    for plane, own in zip(images.float().mean(-1).numpy(), (position - 0.5).tolist(), strict=True):
+        parts = np.array([cv2.getRectSubPix(plane, (side, side), place) for place in own]).reshape(len(own), side**2)
+        found.append(torch.from_numpy(parts - parts.mean(1, keepdims=True)))
+    return torch.nn.functional.cosine_similarity(found[0], found[1])
 
 
 def still_until(simulation: Simulation, video: Footage, tracks: Tracks) -> float:

@@ -29,8 +29,7 @@ from gaussian_swaying.geometry.origin import NO_ORIGIN, Origin
 from gaussian_swaying.rendering.cameras.camera import NEAR, Camera, counted_pose
 from gaussian_swaying.rendering.cameras.transforms_json import load_transforms, read_number, read_pose
 
-MOST_FRAMES = 10_000  # most frames of all videos of a fit
-MOST_BYTES = 2 << 30  # of their pixels: 345 frames of 1920 x 1080
+MOST_BYTES = 2 << 30  # of the pixels of all videos of a fit: 345 frames of 1920 x 1080
 CLOSE = 2e-6  # times of frames of several cameras that are the same [s]
 NARROWEST = 16  # fewest pixels of a frame of a film on its shorter side
 MOST_PIXELS = 40_000_000  # most pixels of a frame of a film; 8K has 33 million. ffmpeg itself refuses larger ones
@@ -63,7 +62,7 @@ class _Room:
     """What the videos of a fit may still decode, and near plane and origin of their cameras."""
 
     def __init__(self, near: float, origin: Origin) -> None:
-        self.frames, self.bytes, self.near, self.origin = MOST_FRAMES, MOST_BYTES, near, origin
+        self.bytes, self.near, self.origin = MOST_BYTES, near, origin
 
     def camera(self, world_to_camera: Tensor, lens: Lens) -> Camera:
         pose = counted_pose(world_to_camera, self.origin).float()
@@ -71,12 +70,12 @@ class _Room:
 
     def take(self, path: Path, width: int, height: int, frames: int = 1) -> None:
         """Count frames of a file."""
-        self.frames, self.bytes = self.frames - frames, self.bytes - frames * 3 * width * height
-        if min(self.frames, self.bytes) < 0:
+        self.bytes -= frames * 3 * width * height
+        if self.bytes < 0:
             raise ValueError(
-                f"The videos have more than {MOST_FRAMES:,} frames or {MOST_BYTES / 2**30:g} GiB of pixels together "
-                f"({path}, {width} x {height}): cut them to the motion that is fitted and predicted, make them "
-                "smaller, or choose `cameras`."
+                f"The videos have more than {MOST_BYTES / 2**30:g} GiB of pixels together ({path}, {width} x "
+                f"{height}): cut them to the motion that is fitted and predicted, make them smaller, or choose "
+                "`cameras`."
             )
 
 
@@ -197,7 +196,7 @@ def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float
     shots: list[Shot] = []
     taken = [] if not begun else ["-ss", f"{begun:.6f}"]
     taken += [] if seconds is None else ["-t", f"{seconds:.6f}"]
-    with closing(frames_of(path, taken, ["-frames:v", str(room.frames + 1), *scaled(*wanted)])) as film:
+    with closing(frames_of(path, taken, scaled(*wanted))) as film:
         head = next_of(film, path)
         size = (0, 0) if head is None else check_wide(path, *head["size"])
         lens = lens_of_transforms(where, data, entry, size)

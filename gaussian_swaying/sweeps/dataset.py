@@ -8,7 +8,7 @@ import os
 from collections.abc import Mapping
 from numbers import Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -22,13 +22,10 @@ from gaussian_swaying.runs.folder import hold_folder
 from gaussian_swaying.runs.lock import FolderLock
 from gaussian_swaying.sweeps.plan import Plan
 
-if TYPE_CHECKING:
-    from PIL.Image import Image
-
 SWEEP, TABLE, PARQUET = "sweep.json", "sweep.csv", "sweep.parquet"
 SHARDS = "shards"
-PER_SHEET = 200  # runs
-WIDTH, BAND, GAP = 240, 34, 4  # pixels of a picture, of the text below it, and between two
+MOST_SHOWN = 200  # runs on the contact sheet
+WIDTH, HEIGHT, BAND, GAP = 240, 160, 34, 4  # pixels of a picture, of the text below it, and between two
 RUNS, RESULTS, LOGS = "runs", "results", "logs"
 OURS = (SWEEP, TABLE, PARQUET, RUNS, RESULTS, LOGS)
 FIGURES = (
@@ -212,45 +209,30 @@ def write_shards(
 
 
 def _numbers(value: Any) -> list[float]:
-    if isinstance(value, Real):
-        return [float(value)]
-    parts = [_numbers(item) for item in value] if isinstance(value, list) else []
-    return [number for part in parts for number in part] if all(parts) else []
+    found = np.asarray(value, dtype=object).ravel().tolist()
+    return list(map(float, found)) if all(isinstance(item, Real) for item in found) else []
 
 
 def _pictures(folder: Path, run: str) -> list[Path]:
     return sorted((folder / RUNS / run / "frames").glob("[0-9]*.png"))
 
 
-def write_contact_sheets(folder: Path) -> None:
-    """Write the last frame of every run: ``contact_sheet.png``, ``contact_sheet_2.png`` and so on for 200 runs each."""
-    runs = {f"{number:05d}": run for number, run in enumerate(read_record(folder)["runs"])}
-    for first in range(0, len(runs), PER_SHEET):
-        number = f"_{first // PER_SHEET + 1}" if first else ""
-        with atomic(folder / f"contact_sheet{number}.png") as temporary:
-            _sheet(folder, dict([*runs.items()][first : first + PER_SHEET])).save(temporary)
-
-
-def _sheet(folder: Path, runs: Mapping[str, Mapping[str, Any]]) -> Image:
+def write_contact_sheet(folder: Path, plan: Plan, results: Mapping[str, Any]) -> None:
+    """Write ``contact_sheet.png``: the last frame of each run, of the first 200, above its values."""
     from PIL import Image, ImageDraw, ImageFont, ImageOps
 
-    results, shown = {name: read_result(folder, name) or {"status": "missing"} for name in runs}, {}
-    for name, result in results.items():
-        pictures = _pictures(folder, name) if result["status"] == "complete" else []
-        if pictures:
-            with Image.open(pictures[-1]) as picture:
-                shown[name] = ImageOps.contain(picture.convert("RGB"), (WIDTH, 4 * WIDTH))
-    height = max((picture.height for picture in shown.values()), default=WIDTH * 9 // 16)
-    across = max(1, min(len(runs), round(math.sqrt(len(runs) * height / WIDTH * 1.6))))
-    size = across * (WIDTH + GAP) + GAP, -(-len(runs) // across) * (height + BAND + GAP) + GAP
-    sheet = Image.new("RGB", size, (24, 24, 24))
+    shown = dict(zip(plan.names[:MOST_SHOWN], plan.runs, strict=False))
+    across = max(1, round(math.sqrt(1.2 * len(shown))))
+    side, step = WIDTH + GAP, HEIGHT + BAND + GAP
+    sheet = Image.new("RGB", (across * side + GAP, -(-len(shown) // across) * step + GAP), (24, 24, 24))
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(12)
-    for number, (name, run) in enumerate(runs.items()):
-        left, top = GAP + number % across * (WIDTH + GAP), GAP + number // across * (height + BAND + GAP)
-        if name in shown:
-            sheet.paste(shown[name], (left, top))
-        else:
-            draw.text((left + WIDTH / 2, top + height / 2), results[name]["status"], font=font, anchor="mm")
+    for number, (name, run) in enumerate(shown.items()):
+        left, top = GAP + number % across * side, GAP + number // across * step
+        status = results.get(name, {"status": "missing"})["status"]
+        if status == "complete" and (pictures := _pictures(folder, name)):
+            with Image.open(pictures[-1]) as picture:
+                sheet.paste(ImageOps.contain(picture.convert("RGB"), (WIDTH, HEIGHT)), (left, top))
         values = ", ".join(f"{axis.rpartition('.')[2]} {json.dumps(value)}" for axis, value in run.items())
-        draw.text((left + 3, top + height + 2), f"{name}\n{values[:40]}", font=font)
-    return sheet
+        draw.text((left + 3, top + HEIGHT + 2), f"{name} {status}\n{values[:40]}", font=font)
+    with atomic(folder / "contact_sheet.png") as temporary:
+        sheet.save(temporary)

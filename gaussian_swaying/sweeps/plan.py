@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from gaussian_swaying._checks import check_choice, check_whole
 from gaussian_swaying._files import sha256
@@ -122,14 +122,6 @@ def runs_of(axes: Mapping[str, Axis], draws: int = 1, seed: int = 0) -> list[dic
     return runs
 
 
-class Sweep(NamedTuple):
-    """A sweep file: configurations of ``sim``, the value of every axis in each run, and options of all runs."""
-
-    base: Sequence[str]
-    runs: Sequence[Mapping[str, Any]]
-    settings: Mapping[str, Any]
-
-
 @dataclass(frozen=True)
 class Plan:
     """A sweep whose settings were checked: the YAML that the runs share, and the value of every axis in each.
@@ -148,8 +140,10 @@ class Plan:
         return [f"{number:05d}" for number in range(len(self.runs))]
 
 
-def read_sweep(path: str | os.PathLike[str], find: Callable[[str], str] = str) -> Sweep:
-    """Read a sweep file, which docs/many.md describes; ``find`` gives the file of a name in ``base``."""
+def read_sweep(
+    path: str | os.PathLike[str], find: Callable[[str], str] = str, parser: ArgumentParser | None = None
+) -> Plan:
+    """The plan of a sweep file, which docs/many.md describes; ``find`` gives the file of a name in ``base``."""
     file = Path(path)
     given = read_fields(file, "the sweep file", FIELDS)
     base = given.get("base")
@@ -171,29 +165,30 @@ def read_sweep(path: str | os.PathLike[str], find: Callable[[str], str] = str) -
     check_whole("draws", draws, 1)
     check_whole("seed", seed, -(1 << 63))
     runs = runs_of({name: read_axis(name, entry) for name, entry in axes.items()}, draws, seed)
-    return Sweep([find(name) for name in base], runs, settings)
+    return make_plan([find(name) for name in base], runs, settings, parser or Simulation.parser())
 
 
-def make_plan(sweep: Sweep, parser: ArgumentParser | None = None) -> Plan:
-    """Check the settings of a sweep as ``sim`` does: the base, and every value of every axis.
+def make_plan(
+    base: Sequence[str], runs: Sequence[Mapping[str, Any]], settings: Mapping[str, Any], parser: ArgumentParser
+) -> Plan:
+    """Check the settings of a sweep as ``sim`` does: configurations, and every value of every axis in its runs.
 
     What a run can only find out when it begins (a pin that holds nothing, a damaged file) is reported by that run.
     """
-    parser = parser or Simulation.parser()
-    files = [word for name in sweep.base for word in ("--config", name)]
-    shared = parser.parse_args([*files, *(option(name, value) for name, value in sweep.settings.items())])
+    files = [word for name in base for word in ("--config", name)]
+    shared = parser.parse_args([*files, *(option(name, value) for name, value in settings.items())])
     check_settings(Simulation, shared)
     config, splats = config_text(parser, shared), set()
-    for number in _telling(sweep.runs):
+    for number in _telling(runs):
         try:
-            settings = parse_run(parser, config, shared.frames, sweep.runs[number])
+            own = parse_run(parser, config, shared.frames, runs[number])
         except (ArgumentError, ValueError) as error:
-            shown = ", ".join(f"{name}: {value}" for name, value in sweep.runs[number].items())
+            shown = ", ".join(f"{name}: {value}" for name, value in runs[number].items())
             told = f"Run {number:05d} ({shown}): {error}"
             raise (ArgumentError(None, told) if isinstance(error, ArgumentError) else type(error)(told)) from error
-        splats.add(settings.scene.ply)
+        splats.add(own.scene.ply)
     checksums = {path: sha256(check_regular(path, "the splat")) for path in sorted(filter(None, splats))}
-    return Plan(config, shared.frames, tuple(sweep.runs), checksums)
+    return Plan(config, shared.frames, tuple(runs), checksums)
 
 
 def parse_run(parser: ArgumentParser, config: str, frames: int, run: Mapping[str, Any]) -> Namespace:

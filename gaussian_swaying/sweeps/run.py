@@ -43,7 +43,7 @@ from gaussian_swaying.sweeps.dataset import (
     read_result,
     result_file,
     result_of,
-    write_contact_sheets,
+    write_contact_sheet,
     write_tables,
 )
 from gaussian_swaying.sweeps.plan import Plan, parse_run
@@ -479,7 +479,7 @@ def run_sweep(
                 if (result := read_result(folder, name)) is not None:
                     results[name] = result
             write_tables(folder, plan, results, parquet)
-        write_contact_sheets(folder)
+        write_contact_sheet(folder, plan, results)
         return results
     finally:
         lock.release()

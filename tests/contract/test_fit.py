@@ -1,7 +1,5 @@
 """Wind and stiffness are found from a short film of half a second, seen by two cameras, with noise."""
 
-import json
-
 import pytest
 from shared import rows
 from small_films import TRUTH
@@ -25,14 +23,13 @@ def test_own_data_with_noise(own, tmp_path, capsys):
     assert set(result.followed) == {"left", "right"}
     assert min(result.followed.values()) > 0.95
     assert not result.at_an_end
-    for shown in result.shown:
-        assert shown.fitted > 35
-        assert shown.predicted > 35
     found = {row["name"]: row for row in rows(tmp_path / "fit/values.csv")}
     assert float(found["material.E"]["value"]) == values["material.E"]
     assert float(found["wind.speed"]["standard_error"]) == result.errors["wind.speed"] > 0
     assert (tmp_path / "fit/pictures/film_left.mp4").stat().st_size > 0
-    assert json.loads((tmp_path / "fit/result.json").read_text())["not_determined"] == result.vague
+    assert [
+        name for name in SOUGHT if f"{name} is not determined" in (tmp_path / "fit/page.html").read_text()
+    ] == result.vague
     again = Simulation.from_yaml(tmp_path / "fit/scene.yaml", device="cpu")
     assert pytest.approx(values["material.E"]) == again.material.E
     assert float(again.wind.flows[0].norm()) == pytest.approx(values["wind.speed"])

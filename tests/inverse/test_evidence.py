@@ -1,37 +1,16 @@
 """Residuals of points that are followed: their weights, clusters, and trust in them."""
 
-import math
-
 import pytest
 import torch
 from small_films import changed
 
 import gaussian_swaying.inverse.evidence as module
-from gaussian_swaying.inverse.evidence import (
-    LEAST_FACING,
-    NOISE,
-    PATCHES,
-    Evidence,
-    compare,
-    distrust,
-    explained,
-    facing,
-    trusted,
-)
+from gaussian_swaying.inverse.evidence import NOISE, PATCHES, Evidence, compare, explained, trusted
 from gaussian_swaying.inverse.tracks import Tracks, track
 from gaussian_swaying.inverse.variants import states_of
 from gaussian_swaying.inverse.videos import read_videos
-from gaussian_swaying.rendering.cameras.camera import look_at_camera
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")
-
-
-def test_points_that_are_seen_edge_on_count_little():
-    """By the cosine of the angle between the ray and the normal."""
-    camera = look_at_camera((0.0, -2.0, 0.0), (0.0, 0.0, 0.0), (0, 0, 1), 40.0, 60, 40)
-    normals = torch.tensor([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.6, 0.8, 0.0], [1.0, 0.0, 0.0]])
-    found = facing(normals, torch.zeros(4, 3), camera)
-    assert found.tolist() == pytest.approx([1.0, 1.0, 0.8, LEAST_FACING], abs=1e-6)
 
 
 def _nothing(simulation, video):
@@ -39,15 +18,6 @@ def _nothing(simulation, video):
     count, frames = len(simulation.scene.moving), len(video.times)
     seen = torch.ones(frames, count, dtype=torch.bool)
     return Evidence(simulation, video, Tracks(torch.arange(count), torch.zeros(frames, count, 2).double(), seen))
-
-
-def test_residuals_are_those_in_pixels_times_their_weight(own, simulation):
-    (left, _) = read_videos(own / "video")
-    evidence = _nothing(simulation, left)
-    shown = evidence.shown(next(states_of(simulation, [{}], [0.0])))
-    expected = facing(simulation.scene.rest().normals[simulation.scene.moving], evidence.rest, left.cameras[0])
-    assert expected.min() < 0.95
-    torch.testing.assert_close(evidence.beside(shown, 0)[0], evidence.pixels(shown, 0) * expected[:, None])
 
 
 def test_a_track_that_slips_explains_nothing_and_no_less(own, simulation):
@@ -68,7 +38,7 @@ def test_a_track_that_slips_explains_nothing_and_no_less(own, simulation):
 def test_tracks_share_their_clusters_over_cameras(own, simulation):
     """A track's error is that of a place of the object, whoever sees it."""
     parts = [_nothing(simulation, video) for video in read_videos(own / "video")]
-    found = compare(simulation, parts, [{}, {}], parts[0].video.times[:3])
+    (found,) = compare(simulation, parts, [{}, {}], parts[0].video.times[:3])
     count = len(simulation.scene.moving)
     assert found.values.shape == (2, 2 * 2 * count, 2)  # two cameras at two times after the start
     own_clusters = found.cluster.reshape(4, count)
@@ -89,12 +59,11 @@ def test_points_count_by_how_far_another_grid_moves_them(own, simulation, left):
     times = left.video.times[:7]
     (part,) = trusted(simulation, [finer], [left], {}, times)
     compared = {"own": (simulation, left), "other": (finer, left.on(finer)), "less": (simulation, part)}
-    values = {name: compare(scene, [e], [{}], times, moving=True).values[0] for name, (scene, e) in compared.items()}
-    weight = left._weight[left.tracks.seen[0]]
-    weights = torch.cat([left._weight[seen] for seen in left.tracks.seen[:7]])
-    away = ((values["other"] - values["own"]) / weights).norm(dim=-1)
+    values = {name: compare(scene, [e], [{}], times, moving=True)[0].values[0] for name, (scene, e) in compared.items()}
+    away = (values["other"] - values["own"]).norm(dim=-1)
     expected = (1 + 0.5 * away.square() / NOISE**2).rsqrt()
-    assert expected[: len(weight)].tolist() == pytest.approx([1.0] * len(weight), abs=1e-4)
+    first = int(left.tracks.seen[0].sum())
+    assert expected[:first].tolist() == pytest.approx([1.0] * first, abs=1e-4)
     assert expected.min() < 0.9
     torch.testing.assert_close(values["less"], expected[:, None] * values["own"], rtol=1e-3, atol=1e-4)
 
@@ -110,15 +79,3 @@ def test_a_grid_on_which_the_scene_diverges_says_nothing(simulation, left, monke
     monkeypatch.setattr(module, "_pixels", lost)
     (part,) = trusted(simulation, [simulation, simulation], [left], {}, left.video.times[:3])
     assert (part.trust == 1).all()
-
-
-def test_less_trust_is_no_better_fit(left):
-    """The likelihood has its logarithm for both coordinates, of the points that are seen in the frames compared."""
-    times = left.video.times[:4]
-    trust = torch.full(left.tracks.seen.shape, 1.0, dtype=torch.float64)
-    trust[2] = 0.5
-    seen = left.tracks.seen[:4]
-    expected = 2 * math.log(2) * int(seen[2].sum()) / int(seen.sum())
-    assert distrust([left], times) == 0.0
-    left.trust = trust
-    assert distrust([left], times) == pytest.approx(expected)

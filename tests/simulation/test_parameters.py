@@ -16,7 +16,7 @@ from gaussian_swaying.scenes.solid import SolidScene
 from gaussian_swaying.simulation.body import Material, Scene
 from gaussian_swaying.simulation.model import Copy, Edit, in_settings, names, number, of_settings
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep
+from gaussian_swaying.sweeps.plan import parse_run, read_sweep
 from gaussian_swaying.sweeps.run import grouped
 from gaussian_swaying.wind.force import AeroForce
 
@@ -229,7 +229,7 @@ def test_parameters_that_are_no_options_are_swept_too(backwards, config, parser,
     axes = {"wind.speed": [2.0, 3.0], "wind.azimuth": [90.0], "wind.modulations.0.period": [1.5]}
     axes = dict(reversed(axes.items())) if backwards else axes
     (tmp_path / "sweep.yaml").write_text(json.dumps({"base": str(tmp_path / "still.yaml"), "axes": axes}))
-    plan = make_plan(read_sweep(tmp_path / "sweep.yaml"), parser)
+    plan = read_sweep(tmp_path / "sweep.yaml", parser=parser)
     found = [parse_run(parser, plan.config, 2, run) for run in plan.runs]
     _close([list(one.wind.flow) for one in found], [[0.0, 2.0, 0.0], [0.0, 3.0, 0.0]])
     assert [one.wind.modulations[0].init_args.period for one in found] == [1.5, 1.5]

@@ -11,14 +11,14 @@ import torch
 from shared import advanced, peak, rows
 
 from gaussian_swaying.cli.sweep import main
-from gaussian_swaying.sweeps.plan import make_plan, read_sweep
+from gaussian_swaying.sweeps.plan import read_sweep
 from gaussian_swaying.sweeps.run import Job, members_of
 
 pytestmark = pytest.mark.gpu
 
 
 def _batch(tmp_path, file):
-    plan = make_plan(read_sweep(file))
+    plan = read_sweep(file)
     job = Job(tmp_path, tuple(plan.names), plan.config, plan.frames, tuple(plan.runs), "cuda")
     members = members_of(job)
     return members[0].batch([member.model for member in members]), members

@@ -9,13 +9,13 @@ from shared import value_error
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.sweeps import plan as plan_module
-from gaussian_swaying.sweeps.plan import Sweep, make_plan, parse_run, read_sweep
+from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep
 
 ROOT = Path(__file__).parents[2]
 
 
 def test_a_plan(tmp_path, sweep_file, parser):
-    plan = make_plan(read_sweep(sweep_file(tmp_path / "a.yaml")), parser)
+    plan = read_sweep(sweep_file(tmp_path / "a.yaml"), parser=parser)
     assert plan.names == [f"{number:05d}" for number in range(8)]
     assert list(plan.runs[0]) == ["wind.flow", "material.E", "wind.seed"]
     assert plan.frames == 12
@@ -30,7 +30,7 @@ def test_a_plan(tmp_path, sweep_file, parser):
 
 
 def test_frames_can_be_an_axis(tmp_path, sweep_file, parser):
-    plan = make_plan(read_sweep(sweep_file(tmp_path / "a.yaml", {"material.E": [1e3], "wind.seed": [3]}, 1)), parser)
+    plan = read_sweep(sweep_file(tmp_path / "a.yaml", {"material.E": [1e3], "wind.seed": [3]}, 1), parser=parser)
     assert parse_run(parser, plan.config, plan.frames, {"frames": 5}).frames == 5
 
 
@@ -38,7 +38,7 @@ def test_splats_are_remembered_by_their_content(tmp_path, sweep_file, parser):
     write_ply(tmp_path / "one.ply", FlagScene(spacing=0.2).generate())
     write_ply(tmp_path / "two.ply", FlagScene(spacing=0.3).generate())
     axes = {"scene.ply": [str(tmp_path / "one.ply"), str(tmp_path / "two.ply")]}
-    plan = make_plan(read_sweep(sweep_file(tmp_path / "a.yaml", axes, 1)), parser)
+    plan = read_sweep(sweep_file(tmp_path / "a.yaml", axes, 1), parser=parser)
     assert set(plan.splats) == set(axes["scene.ply"])
     assert len(set(plan.splats.values())) == 2
 
@@ -60,20 +60,20 @@ def test_every_value_is_checked_but_not_hundreds_of_seeds(parser, monkeypatch, r
 
     monkeypatch.setattr(plan_module, "parse_run", parse)
     values = [{"material.E": 1e3 * (1 + k // 40), "wind.seed": k % seeds} for k in range(runs)]
-    make_plan(Sweep([], values, {}), parser)
+    make_plan([], values, {}, parser)
     assert told == [values[k] for k in checked]
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / "configs/sweep").glob("*.yaml")), ids=lambda path: path.stem)
 def test_shipped_sweeps_are_valid(file, parser):
-    plan = make_plan(read_sweep(file, lambda name: str(ROOT / "configs/sim" / f"{name}.yaml")), parser)
+    plan = read_sweep(file, lambda name: str(ROOT / "configs/sim" / f"{name}.yaml"), parser)
     assert len(plan.runs) > 1
 
 
 def test_the_sweep_of_the_page(tmp_path, parser):
     (tmp_path / "page.yaml").write_text((ROOT / "docs/many.md").read_text().split("```yaml\n")[1].split("```")[0])
-    sweep = read_sweep(tmp_path / "page.yaml", lambda name: str(ROOT / "configs/sim" / f"{name}.yaml"))
-    assert len(make_plan(sweep, parser).runs) == 30
+    plan = read_sweep(tmp_path / "page.yaml", lambda name: str(ROOT / "configs/sim" / f"{name}.yaml"), parser)
+    assert len(plan.runs) == 30
 
 
 @pytest.mark.parametrize(
@@ -119,6 +119,6 @@ def test_files_that_are_no_sweep(tmp_path, text):
 def test_values_that_sim_does_not_accept(parser, axes, words):
     runs = [dict(zip(axes, values, strict=True)) for values in zip(*axes.values(), strict=True)]
     with pytest.raises((ValueError, ArgumentError)) as error:
-        make_plan(Sweep([str(ROOT / "configs/sim/flag.yaml")], runs, {}), parser)
+        make_plan([str(ROOT / "configs/sim/flag.yaml")], runs, {}, parser)
     for word in words:
         assert word in str(error.value)

@@ -18,7 +18,7 @@ from gaussian_swaying.cli.sweep import explain, main
 from gaussian_swaying.runs.lock import LOCK, FolderLock
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.sweeps import run
-from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep
+from gaussian_swaying.sweeps.plan import parse_run, read_sweep
 from gaussian_swaying.sweeps.run import Job, Outcome, drive, work
 
 QUICK = ["--workers", "2", "--device", "cpu"]
@@ -99,7 +99,7 @@ def test_killed_workers_change_nothing(undisturbed, tmp_path, sweep_file, kill):
 
 
 def test_a_run_goes_on_where_its_worker_was_killed(undisturbed, tmp_path, sweep_file):
-    plan, parser = make_plan(read_sweep(sweep_file(tmp_path / "tiny.yaml"))), Simulation.parser()
+    plan, parser = read_sweep(sweep_file(tmp_path / "tiny.yaml")), Simulation.parser()
     for place in ("runs", "results", "logs"):
         (tmp_path / place).mkdir()
     begun = Simulation.from_settings(parser, parse_run(parser, plan.config, 5, plan.runs[5]))

@@ -10,7 +10,7 @@ from shared import rows
 from gaussian_swaying.cli.sweep import main
 from gaussian_swaying.config.parser import config_text
 from gaussian_swaying.simulation.simulation import Simulation
-from gaussian_swaying.sweeps.plan import make_plan, parse_run, read_sweep
+from gaussian_swaying.sweeps.plan import parse_run, read_sweep
 from gaussian_swaying.sweeps.run import Job, grouped, members_of
 
 FIXED = {"solver.substep": 2e-3, "frames": 5}
@@ -57,7 +57,7 @@ def test_together_as_alone(tmp_path, sweep_file):
 
 
 def test_the_state_of_a_scene(tmp_path, sweep_file):
-    plan = make_plan(read_sweep(sweep_file(tmp_path / "tiny.yaml", settings=FIXED)))
+    plan = read_sweep(sweep_file(tmp_path / "tiny.yaml", settings=FIXED))
     job = Job(tmp_path, tuple(plan.names), plan.config, plan.frames, tuple(plan.runs), "cpu")
     members = members_of(job)
     together = members[0].batch([member.model for member in members])
@@ -77,7 +77,7 @@ def test_the_state_of_a_scene(tmp_path, sweep_file):
 def test_the_configurations_of_a_group_are_those_that_the_parser_writes(tmp_path, sweep_file):
     axes = {"wind.flow": [[3.0, 1.0, 0.0], [6, 1.5, -0.25]], "material.E": [3e3, 1e-2], "material.nu": [0.3, 0.0]}
     axes |= {"wind.seed": [1, 7], "material.density": [20, 30.5]}
-    plan = make_plan(read_sweep(sweep_file(tmp_path / "tiny.yaml", axes=axes, draws=1)))
+    plan = read_sweep(sweep_file(tmp_path / "tiny.yaml", axes=axes, draws=1))
     runs, parser = (plan.runs[0], *plan.runs[6::6]), Simulation.parser()
     members = members_of(Job(tmp_path, ("",) * len(runs), plan.config, plan.frames, runs, "cpu"))
     settings = [parse_run(parser, plan.config, plan.frames, run) for run in runs]
