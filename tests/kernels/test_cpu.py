@@ -368,3 +368,20 @@ def test_numbers_and_tensors_of_all_types_are_passed():
         assert float(x) == 16
     with pytest.raises(KeyError, match="uint8"):  # its bytes would be read with a sign
         launch(_advance, (1,))(torch.zeros(1, dtype=torch.uint8), 3)
+
+
+@triton.jit
+def _precise(x, out, tenth):
+    found = tl.zeros([1], tl.float32) + tenth + 0.2
+    tl.store(out + tl.arange(0, 1), tl.load(x).to(tl.float32) / 3 + found)
+
+
+def test_double_precision():
+    x, out = torch.tensor([1]), torch.zeros(1).double()
+    launch(_precise, (1,))(x, out, 0.1)
+    assert abs(float(out) - (1 / 3 + 0.3)) < 1e-15
+    launch(_precise, (1,))(x.float(), out, 0.1)
+    assert 1e-15 < abs(float(out) - (1 / 3 + 0.3)) < 1e-7
+    single = torch.zeros(1)
+    launch(_precise, (1,))(x.double(), single, 0.1)
+    assert abs(float(single) - (1 / 3 + 0.3)) < 1e-7
