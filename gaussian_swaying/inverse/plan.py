@@ -134,13 +134,11 @@ def at_scale(model: Model, metres_per_unit: float) -> Model:
     """A model, whose values are meant in metres, that moves as if a scene unit had another length [m]."""
     wind, scene = model.wind, model.scene
     gravity, sheet = model.value("solver.gravity"), not scene.filled
-    plain = isinstance(wind, WindField) and not (
-        len(wind.modulations) or len(wind.effects) or model.air or model.forces
-    )
     single = model.material.volume == "patch" and model.points.count == scene.on_surface + scene.filled
     bending = model.points.bending
-    own = bending is None or not (isinstance(model.material.bending, str) or model.material.regions)
-    if not (any(gravity) and plain and single and own):
+    single &= bending is None or not (isinstance(model.material.bending, str) or model.material.regions)
+    single &= any(gravity) and not (model.air or model.forces)
+    if not (single and isinstance(wind, WindField)) or len(wind.modulations) or len(wind.effects):
         raise ValueError(
             f"`{SCALE}` can be sought only under `solver.gravity`, in a plain wind (no `wind.modulations`, "
             "`wind.effects`, `air` and `forces`), with `material.volume: patch`, `scene.layers: 1` and no or one "

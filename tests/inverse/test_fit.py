@@ -45,8 +45,9 @@ def test_starts_that_are_far_off(fitted, tmp_path, capsys):
     result = fitted(sought, search=16, progress=True)
     assert result.values["wind.speed"] == pytest.approx(TRUTH["wind.speed"], rel=0.01)
     assert result.values["wind.azimuth"] == pytest.approx(TRUTH["wind.azimuth"], abs=1.0)
-    assert capsys.readouterr().err.count("] start to ") >= 2
+    assert "] start to " in capsys.readouterr().err
     course = json.loads((tmp_path / "fit/fit.json").read_text())["course"]
+    assert len(course["starts"]) > 1
     assert [len(place) for place in course["rivals"]] == [3] * len(course["rivals"])
 
 
