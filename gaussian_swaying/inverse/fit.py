@@ -228,7 +228,7 @@ class Problem:
         return found
 
     def trusted(self, evidence: Sequence[Evidence], place: Sequence[float]) -> list[Evidence]:
-        return trusted(self.simulation, self.grids, evidence, self.values(place), self.fitted)
+        return trusted(evidence, self.grids, self.values(place), self.fitted)
 
     def _states(self, place: Sequence[float], times: Sequence[float]) -> list[State]:
         return [own[0] for own in states_of(self.simulation, [self.values(place)], times, alike=False)]
@@ -241,7 +241,7 @@ class Problem:
 
         def at(places: Tensor) -> Block:
             values = [self.values(place) for place in places]
-            return compare(self.simulation, evidence, values, times, self.moving, tick=self.say.tick)[0]
+            return compare(evidence, values, times, self.moving, tick=self.say.tick)[0]
 
         return at
 
@@ -282,7 +282,7 @@ class Problem:
             starts = [step * k for k in numbers] or [known.low]
         values, scale = [self.values(place) for place in places], COARSE * max(video.size[0] for video in self.videos)
         with self.say.work("search", len(places) * len(times)):
-            found = compare(self.simulation, evidence, values, times, self.moving, starts, self.say.tick)
+            found = compare(evidence, values, times, self.moving, starts, self.say.tick)
         costs, best = torch.stack([cost_of(block, scale) for block in found]).min(0)
         if known is not None:
             places[:, self.sought[FILM_START]] = torch.tensor([known.share(start) for start in starts]).double()[best]
@@ -416,7 +416,8 @@ class Problem:
     def result(self, course: Course, evidence: Sequence[Evidence], films: Path | None) -> Fit:
         place, values = torch.tensor(course.place, dtype=torch.float64), self.values(course.place)
         normal = linearised(self.residuals(evidence, self.fitted), place)
-        worse: dict[str, float] = {}
+        pairs = zip(self.videos, self.tracks, strict=True)
+        held, worse = [Evidence(self.simulation, video, split(own)[1]) for video, own in pairs], dict[str, float]()
         if films:
             runs = states_of(self.simulation, [values], self.times, alike=False)
             moved = (self.simulation.painter.deformed(state) for (state,) in runs)
@@ -430,7 +431,7 @@ class Problem:
             "" if course.ended else UNSETTLED,
             tuple(self.notes()),
             worse,
-            explained(self.simulation, self.videos, self.tracks, values, self.fitted),
+            explained(held, values, self.fitted),
             consequences(self.plan.assumed, values, self.simulation),
             self.told,
             self.others(course.place, course.rivals),
@@ -440,11 +441,9 @@ class Problem:
         """The covariance that the grid adds at a place, (U, U): how far the minimum of another grid is."""
         found = torch.zeros(len(place), len(place), dtype=torch.float64)
         for other in self.grids:
-            own = [part.on(other) for part in evidence]
-            there = copy(self)
-            there.simulation = other
             with suppress(DivergedError):
-                end = there.solved(place.tolist(), own, self.fitted, REFINED, True).place
+                own = [part.on(other) for part in evidence]
+                end = self.solved(place.tolist(), own, self.fitted, REFINED, True).place
                 found += torch.outer(end - place, end - place)
         return found
 

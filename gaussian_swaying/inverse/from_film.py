@@ -24,7 +24,7 @@ from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.grouping import connected_parts
 from gaussian_swaying.gaussians.hold import given_hold
-from gaussian_swaying.gaussians.measures import DIRECTIONS
+from gaussian_swaying.gaussians.measures import DIRECTIONS, plane_axes, sides
 from gaussian_swaying.geometry.neighbours import particle_spacing
 from gaussian_swaying.inverse.fit import run_fit
 from gaussian_swaying.inverse.plan import FILM_START, SCALE, read_plan
@@ -338,7 +338,10 @@ def prepare(
         )
     write_starter(preview, folder / LOOK, 250)
     iio.imwrite(folder / LOOK / "preview.png", preview.picture())
-    text = plan_text(preview, _background(seen), None if at_once else moves - begin, length, folder)
+    around = seen.picture.alpha[..., 0].cpu() < 0.05  # the colour that most of it has is the background
+    pixels = seen.frame[around] if bool(around.any()) else seen.frame.flatten(0, 1)
+    colour = [round(value / 255, 3) for value in pixels.median(0).values.tolist()]
+    text = plan_text(preview, colour, None if at_once else moves - begin, length, folder)
     keep_aside(folder / PLAN, text)
     write_text(folder / PLAN, text)
     say(f"{film} moves from {moves:.2f} s on; {begin:.2f} s to {begin + seconds:.2f} s of it are used")
@@ -371,13 +374,6 @@ def registered(
         f"{source} ({fov_of(found.camera):.0f} degrees from top to bottom)"
     )
     return Seen(head, frame, cloud, found.camera, picture, found.residual), told
-
-
-def _background(seen: Seen) -> list[float]:
-    """The colour that most of the first frame has where the splat is not, or all of it."""
-    around = seen.picture.alpha[..., 0].cpu() < 0.05
-    pixels = seen.frame[around] if bool(around.any()) else seen.frame.flatten(0, 1)
-    return [round(value / 255, 3) for value in pixels.median(0).values.tolist()]
 
 
 def _shown(seen: Seen, video: Footage, preview: Suggestion, wanted: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
@@ -441,12 +437,10 @@ def longest_side(name: str, metres: float, seen: Seen, preview: Suggestion) -> f
 
 def extent(points: Tensor, up: Sequence[float]) -> float:
     """The longest side of an upright box around points (N, 3) [scene units], turned as they are seen from above."""
-    axis = torch.nn.functional.normalize(torch.tensor(up, dtype=torch.float64), dim=0)
-    centred = points.double() - points.double().mean(0)
-    level = centred - (centred @ axis)[:, None] * axis
-    sides = torch.linalg.eigh(level.T @ level)[1].T[1:]
-    along = centred @ torch.cat([axis[None], sides]).T
-    return float((along.quantile(0.998, 0) - along.quantile(0.002, 0)).max())
+    axis, own = np.asarray(up) / np.linalg.norm(up), points.double().numpy()
+    level = own @ plane_axes(axis)
+    turned = level @ np.linalg.eigh(np.cov(level.T))[1]
+    return float(sides(np.column_stack([own @ axis, turned]), 0.002).max())
 
 
 def _place(name: str, number: int, seen: Seen) -> Tensor:

@@ -177,7 +177,8 @@ def write_films(
                     errors[video.name] += [float((shown - real).square().mean())] if k < fitted else []
         for encoder in encoders:
             encoder.finish()
-    return {name: 10 * math.log10(max(sum(e) / len(e), 1e-12) / max(e[0], 1e-12)) for name, e in errors.items()}
+    shares = {name: max(sum(own) / len(own), 1e-12) / max(own[0], 1e-12) for name, own in errors.items() if own}
+    return {name: 10 * math.log10(share) for name, share in shares.items()}
 
 
 def write_results(
