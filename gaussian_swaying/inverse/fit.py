@@ -134,8 +134,8 @@ class Course:
 class Problem:
     """The unknowns of a simulation, and the videos from which they are found.
 
-    ``grids`` are the simulation on other grids, ``looked`` sentences on cameras, and ``told`` and ``doubts`` what the
-    background says.
+    ``grids`` are the simulation on other grids, ``told`` what the background says, and ``doubts`` what speaks against
+    the videos.
     """
 
     def __init__(
@@ -145,13 +145,12 @@ class Problem:
         plan: Plan,
         say: Say | None = None,
         grids: Sequence[Simulation] = (),
-        looked: Sequence[str] = (),
         told: Sequence[str] = (),
         doubts: Sequence[str] = (),
     ) -> None:
         check_unknowns(simulation, plan.unknowns)
         self.simulation, self.videos, self.plan = simulation, list(videos), plan
-        self.say, self.grids, self.looked, self.told, self.doubts = say or Say(False), grids, looked, told, doubts
+        self.say, self.grids, self.told, self.doubts = say or Say(False), grids, told, doubts
         self.times = frame_times(videos)
         fitted = max(3, round(0.5 * len(self.times)))
         if plan.until is not None:
@@ -417,11 +416,7 @@ class Problem:
         place, values = torch.tensor(course.place, dtype=torch.float64), self.values(course.place)
         normal = linearised(self.residuals(evidence, self.fitted), place)
         pairs = zip(self.videos, self.tracks, strict=True)
-        held, worse = [Evidence(self.simulation, video, split(own)[1]) for video, own in pairs], dict[str, float]()
-        if films:
-            runs = states_of(self.simulation, [values], self.times, alike=False)
-            moved = (self.simulation.painter.deformed(state) for (state,) in runs)
-            worse = write_films(films, self.simulation, self.videos, self.times, len(self.fitted), moved)
+        held = [Evidence(self.simulation, video, split(own)[1]) for video, own in pairs]
         return Fit(
             self.plan.unknowns,
             tuple(course.place),
@@ -430,7 +425,7 @@ class Problem:
             course.seconds,
             "" if course.ended else UNSETTLED,
             tuple(self.notes()),
-            worse,
+            write_films(films, held, values, self.times, len(self.fitted)) if films else {},
             explained(held, values, self.fitted),
             consequences(self.plan.assumed, values, self.simulation),
             self.told,
@@ -457,8 +452,8 @@ class Problem:
                 "The camera was found from a frame in which the object may move already, so all values may be off: "
                 "give a film that begins at rest."
             )
-        found += [*self.doubts, *self.looked]
-        pairs = [] if self.looked or self.begins is not None else zip(self.videos, self.tracks, strict=True)
+        found += self.doubts
+        pairs = [] if self.doubts or self.begins is not None else zip(self.videos, self.tracks, strict=True)
         still = min((still_until(self.simulation, video, own) for video, own in pairs), default=0.0)
         if still >= LONG_STILL:
             found.append(
@@ -542,7 +537,7 @@ def _ready(plan: Plan, parser: Any, settings: Any, device: str, progress: bool) 
         videos, told, doubts = prepared(simulation, videos, plan.hand_held, plan.also_moves, say.tick)
     for line in told:
         say(line)
-    return Problem(simulation, videos, plan, say, _other_grids(simulation, say), looked, told, doubts)
+    return Problem(simulation, videos, plan, say, _other_grids(simulation, say), told, [*looked, *doubts])
 
 
 def _other_grids(simulation: Simulation, say: Say) -> list[Simulation]:

@@ -127,7 +127,7 @@ def test_a_camera_in_another_unit_is_said(room, plan_of, tmp_path, factor, earli
     (told,) = first_look(room, video, earliest)
     assert float(told.split("the splat ")[1].split()[0]) == pytest.approx(factor, rel=0.15)
     assert "in another unit than the splat, or it is another camera" in told
-    assert Problem(room, [video], plan, looked=[told]).notes() == [told]
+    assert Problem(room, [video], plan, doubts=[told]).notes() == [told]
     assert first_look(room, right, earliest) == []
 
 
