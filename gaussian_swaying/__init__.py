@@ -6,10 +6,9 @@ Docstrings of internal functions leave out arguments whose names mean the same e
 ``dt`` substep [s], ``frame_dt`` [s]; of Gaussians ``means`` [scene units] (N, 3), ``covariances`` (N, 3, 3),
 ``quats`` wxyz of any length above zero (N, 4), ``log_scales`` of standard deviations [scene units] (N, 3),
 ``opacities`` from 0 to 1 (N,), ``colors`` as displayed (N, 3), ``sh`` (N, K, 3) with K = 1, 4, 9 or 16, unit
-``normals`` of either sign (N, 3), ``background`` (3,), black if None, ``eps2d`` added to the diagonal of projected
-covariances [pixels²]; ``reduction`` over Gaussians, ``mean`` or ``sum``; ``E``, ``mu``, ``lam`` [Pa], ``nu``, ``F``
-(..., 3, 3); ``metres_per_unit`` of a scene, and its ``rotation`` to z up (3, 3); ``width``, ``height`` of images
-[pixels].
+``normals`` of either sign (N, 3), ``background`` (3,), black if None; ``reduction`` over Gaussians, ``mean`` or
+``sum``; ``E``, ``mu``, ``lam`` [Pa], ``nu``, ``F`` (..., 3, 3); ``metres_per_unit`` of a scene, and its ``rotation`` to
+z up (3, 3); ``width``, ``height`` of images [pixels].
 """
 
 import lazy_loader

@@ -33,7 +33,7 @@ GONE = {
     **{f"{name}Camera.interpolation": "the default, smooth" for name in ("LookAt", "Capture")},
     **{f"SolidScene.{name}": "the default" for name in ("jitter", "overlap", "seed")},
     "VelocityBox.travels": "nothing, as all do",
-    "PhongShader": "DiffuseShader with `ambient`, `specular` and `shininess`",
+    "PhongShader": "DiffuseShader with `ambient`",
     "LogProfile": "Profile",
     "PowerProfile": "Profile with an `exponent`",
     "CylinderObstacle": "Obstacle with a null among its `radii`",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from gaussian_swaying.geometry.linalg_triton import add3, cross3, dot3, load3
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.kernels.launch import lanes, launch
 
@@ -22,35 +23,27 @@ def _cells(
     zero = 0 * farthest
     alone = zero
     for a in range(K):
-        x = tl.load(offset + a * count + lane, mask, 0.0)
-        y = tl.load(offset + (K + a) * count + lane, mask, 0.0)
-        z = tl.load(offset + (2 * K + a) * count + lane, mask, 0.0)
+        p = load3(offset, K * count, a * count + lane, mask)
         again = tl.where(tl.load(distance + a * count + lane, mask, 0.0) < close, 1.0, zero)
         for b in range(a):
-            dx = x - tl.load(offset + b * count + lane, mask, 0.0)
-            dy = y - tl.load(offset + (K + b) * count + lane, mask, 0.0)
-            dz = z - tl.load(offset + (2 * K + b) * count + lane, mask, 0.0)
-            again = tl.where(tl.sqrt(dx * dx + dy * dy + dz * dz) < close, 1.0, again)
+            gap = add3(p, -1.0, load3(offset, K * count, b * count + lane, mask))
+            again = tl.where(tl.sqrt(dot3(gap, gap)) < close, 1.0, again)
         tl.store(repeat + a * count + lane, again, mask)
         alone += 1 - again
     spacing = farthest * tl.sqrt(PI / tl.maximum(alone, 1.0))
 
     # two axes in the plane of the site
-    nx = tl.load(normal + lane, mask, 1.0)
-    ny = tl.load(normal + count + lane, mask, 0.0)
-    nz = tl.load(normal + 2 * count + lane, mask, 0.0)
-    least_x = (tl.abs(nx) <= tl.abs(ny)) & (tl.abs(nx) <= tl.abs(nz))
-    least_y = tl.abs(ny) <= tl.abs(nz)
-    ux = tl.where(least_x, zero, tl.where(least_y, nz, -ny))
-    uy = tl.where(least_x, -nz, tl.where(least_y, zero, nx))
-    uz = tl.where(least_x, ny, tl.where(least_y, -nx, zero))
-    length = tl.maximum(tl.sqrt(ux * ux + uy * uy + uz * uz), 1e-12)
-    ux = ux / length
-    uy = uy / length
-    uz = uz / length
-    vx = ny * uz - nz * uy
-    vy = nz * ux - nx * uz
-    vz = nx * uy - ny * ux
+    n = load3(normal, count, lane, mask)
+    least_x = (tl.abs(n[0]) <= tl.abs(n[1])) & (tl.abs(n[0]) <= tl.abs(n[2]))
+    least_y = tl.abs(n[1]) <= tl.abs(n[2])
+    u = (
+        tl.where(least_x, zero, tl.where(least_y, n[2], -n[1])),
+        tl.where(least_x, -n[2], tl.where(least_y, zero, n[0])),
+        tl.where(least_x, n[1], tl.where(least_y, -n[0], zero)),
+    )
+    length = tl.maximum(tl.sqrt(dot3(u, u)), 1e-12)
+    u = (u[0] / length, u[1] / length, u[2] / length)
+    v = cross3(n, u)
 
     own = tl.load(disc + lane, mask, 1.0)
     found = zero
@@ -58,12 +51,10 @@ def _cells(
     stacks = zero
     around = own
     for a in range(K):
-        x = tl.load(offset + a * count + lane, mask, 0.0)
-        y = tl.load(offset + (K + a) * count + lane, mask, 0.0)
-        z = tl.load(offset + (2 * K + a) * count + lane, mask, 0.0)
-        first = x * ux + y * uy + z * uz
-        second = x * vx + y * vy + z * vz
-        sheet = tl.abs(x * nx + y * ny + z * nz) <= SLAB * spacing
+        p = load3(offset, K * count, a * count + lane, mask)
+        first = dot3(p, u)
+        second = dot3(p, v)
+        sheet = tl.abs(dot3(p, n)) <= SLAB * spacing
         stacked = sheet & (first * first + second * second <= 1e-12 * (spacing * spacing))
         beside = tl.where(stacked, zero, tl.where(sheet, 1.0, zero))
         tl.store(flat + a * count + lane, first, mask)

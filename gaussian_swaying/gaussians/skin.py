@@ -22,6 +22,7 @@ from gaussian_swaying.geometry.linalg_triton import (
     load9,
     matvec,
     outer3,
+    plus_identity,
     scale3,
     store3,
     where3,
@@ -53,7 +54,7 @@ def completed(G, axis, kind):
     ``axis`` is the unit normal of a sheet (``kind`` 2), which stays normal and keeps its thickness (Kirchhoff's
     hypothesis), or the unit tangent of a line (``kind`` 1), which turns by the smallest rotation.
     """
-    F = (G[0] + 1, G[1], G[2], G[3], G[4] + 1, G[5], G[6], G[7], G[8] + 1)
+    F = plus_identity(G)
     across, _det = area_vector(F, axis)
     size = tl.sqrt(dot3(across, across))
     normal = where3(size > 0, scale3(1.0 / tl.where(size > 0, size, 1.0), across), axis)
@@ -96,7 +97,7 @@ def _skin(
             slope = load3(slopes, WIDTH, 3 * (first + WIDTH * k) + column, mask)
             G = axpy9(1.0, outer3(step, slope), 1.0, G)
     if GIVEN:
-        F = (G[0] + 1, G[1], G[2], G[3], G[4] + 1, G[5], G[6], G[7], G[8] + 1)
+        F = plus_identity(G)
     else:
         F = completed(G, load3(axis, 1, 3 * lane, mask), tl.load(kind + lane, mask, 3))
     a = load3(arm, 1, 3 * lane, mask)

@@ -176,6 +176,12 @@ def add3(a, t, b):
 
 
 @triton.jit
+def plus_identity(G):
+    """I + G, the deformation gradient of a gradient of displacements."""
+    return (G[0] + 1, G[1], G[2], G[3], G[4] + 1, G[5], G[6], G[7], G[8] + 1)
+
+
+@triton.jit
 def columns9(a, b, c):
     """The matrix of three columns."""
     return transpose(a + b + c)

@@ -21,7 +21,7 @@ from gaussian_swaying.geometry.distance import DistanceGrid, distance_at, half_s
 from gaussian_swaying.geometry.frame import SimFrame
 from gaussian_swaying.geometry.keyed_path import KeyedPath, fastest, keys_before, rigid_motion, rigid_motions
 from gaussian_swaying.geometry.linalg import vectors
-from gaussian_swaying.geometry.linalg_triton import add3, dot3, matvec, read, transpose
+from gaussian_swaying.geometry.linalg_triton import add3, axpy3, dot3, matvec, read, transpose
 from gaussian_swaying.geometry.regions import Box, HalfSpace, Region
 from gaussian_swaying.geometry.rotations import rotation_of
 from gaussian_swaying.kernels.derive import Memory, on_tensors
@@ -42,7 +42,7 @@ def touch(x, numbers, rows, step, mask, SOLIDS: tl.constexpr, w: tl.constexpr):
     pose = own_numbers + 2
     if MOVES:
         pose = rows + step * SOLIDS.width + SOLIDS.per_substep[w][0]
-    x = (x[0] - tl.load(pose), x[1] - tl.load(pose + 1), x[2] - tl.load(pose + 2))
+    x = add3(x, -1.0, read(pose, 0, 3))
     own = x
     if MOVES:
         own = matvec(transpose(read(pose, 3, 9)), x)
@@ -53,8 +53,7 @@ def touch(x, numbers, rows, step, mask, SOLIDS: tl.constexpr, w: tl.constexpr):
     drive = (zero, zero, zero)
     if MOVES:
         normal = matvec(read(pose, 3, 9), normal)
-        drive = matvec(read(pose, 12, 9), x)
-        drive = (drive[0] + tl.load(pose + 21), drive[1] + tl.load(pose + 22), drive[2] + tl.load(pose + 23))
+        drive = add3(matvec(read(pose, 12, 9), x), 1.0, read(pose, 21, 3))
     return distance - tl.load(own_numbers), normal, drive
 
 
@@ -63,12 +62,12 @@ def stopped(v, n, kind: tl.constexpr, friction):
     """Velocity in contact with a plane at rest; ``kind`` is a number of ``KINDS``."""
     along = dot3(v, n)
     removed = tl.where(kind == 2, tl.minimum(along, 0.0), along)
-    t = (v[0] - along * n[0], v[1] - along * n[1], v[2] - along * n[2])
+    t = add3(v, -along, n)
     speed = tl.maximum(tl.sqrt(dot3(t, t)), 1.1754944e-38)
     left = tl.where(friction > 0, tl.maximum(1 - friction * tl.abs(removed) / speed, 0.0), 1.0)
     left = tl.where(kind == 0, 0.0, left)
     rest = tl.where(kind == 0, 0.0, along - removed)
-    return left * t[0] + rest * n[0], left * t[1] + rest * n[1], left * t[2] + rest * n[2]
+    return axpy3(left, t, rest, n)
 
 
 @triton.jit

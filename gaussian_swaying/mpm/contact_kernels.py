@@ -6,7 +6,18 @@ pair is kept at both of its samples; the sums at samples and nodes have the same
 ``contact_lists`` lists the samples that may touch in the next ones.
 """
 
-from gaussian_swaying.geometry.linalg_triton import add3, dot3, load3
+from gaussian_swaying.geometry.linalg_triton import (
+    add3,
+    axpy3,
+    cofactor,
+    dot3,
+    load3,
+    matvec,
+    plus_identity,
+    store3,
+    transpose,
+    where3,
+)
 from gaussian_swaying.kernels.language import ON_GPU, tl, triton
 from gaussian_swaying.mpm.colliders import acts, touch
 from gaussian_swaying.mpm.shared_kernels import VARIES, axis_weights, node_weight, vector
@@ -110,11 +121,10 @@ def interpolate(
 def three(x):
     """The first three columns of a tile of four."""
     column = tl.arange(0, 4)[None, :]
-    return (
-        tl.sum(tl.where(column == 0, x, 0.0), 1),
-        tl.sum(tl.where(column == 1, x, 0.0), 1),
-        tl.sum(tl.where(column == 2, x, 0.0), 1),
-    )
+    found = ()
+    for k in tl.static_range(3):
+        found = found + (tl.sum(tl.where(column == k, x, 0.0), 1),)
+    return found
 
 
 @triton.jit
@@ -133,9 +143,7 @@ def place_now(
     u, v, d0, d1, d2 = interpolate(
         fields, base, fraction, arm, places, p, mask, sx, sy, inverse_dx, DERIVATIVES, BOTH, ARMS, VIRTUAL, BLOCK
     )
-    x = load3(rest, places, p, mask)
-    u0, u1, u2 = three(u)
-    return (x[0] + u0, x[1] + u1, x[2] + u2), v, d0, d1, d2
+    return add3(load3(rest, places, p, mask), 1.0, three(u)), v, d0, d1, d2
 
 
 @triton.jit
@@ -161,8 +169,7 @@ def contact_positions(
     x, v, _a, _b, _c = place_now(
         fields, base, fraction, arm, rest, places, p, mask, sx, sy, inverse_dx, False, True, ARMS, VIRTUAL, BLOCK
     )
-    for c in tl.static_range(3):
-        tl.store(position + p * 3 + c, x[c], mask)
+    store3(position, 1, p * 3, x, mask)
     store_velocity(moving, p, mask, v)
     if tl.program_id(0) == 0:
         tl.store(status + ACTING, 0)
@@ -200,17 +207,22 @@ def contact_cells(
     p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = p < active_nodes
     at = fields + tl.load(active + p, mask, 0) * 8
-    for c in tl.static_range(3):
-        tl.store(before + p * 3 + c, tl.load(at + c, mask, 0.0), mask)
+    store3(before, 1, p * 3, vector(at, mask), mask)
     mask = p < places
     inverse = 1 / tl.load(limit)
     x = vector(position + p * 3, mask)
     cx = cell_of(x[0], tl.load(low), inverse)
     cy = cell_of(x[1], tl.load(low + 1), inverse)
-    for c in tl.static_range(3):
-        tl.store(cells + c * places + p, x[c], mask)
+    store3(cells, places, p, x, mask)
     tl.store(cells + 3 * places + p, column_of(cx, cy), mask)
     tl.store(hashes + p, hashed(cx, cy, last) + cell_of(x[2], tl.load(low + 2), inverse), mask)
+
+
+@triton.jit
+def _squared(field, places, at, known, x):
+    """Squared distances of several places from each x."""
+    d = add3(load3(field, places, at, known), -1.0, (x[0][:, None], x[1][:, None], x[2][:, None]))
+    return dot3(d, d)
 
 
 @triton.jit(do_not_specialize=CHANGES)
@@ -245,15 +257,9 @@ def contact_lists(
             known = (k + wide) < length[:, None]
             e = begin[:, None] + k + wide
             known = known & (tl.load(ordered + 3 * places + e, known, 0.0) == column_of(cx, cy)[:, None])
-            q0 = tl.load(ordered + e, known, 0.0) - x[0][:, None]
-            q1 = tl.load(ordered + places + e, known, 0.0) - x[1][:, None]
-            q2 = tl.load(ordered + 2 * places + e, known, 0.0) - x[2][:, None]
-            known = known & (q0 * q0 + q1 * q1 + q2 * q2 < size * size)
+            known = known & (_squared(ordered, places, e, known, x) < size * size)
             q = tl.load(order + e, known, 0)
-            q0 = tl.load(rest + q, known, 0.0) - r[0][:, None]
-            q1 = tl.load(rest + places + q, known, 0.0) - r[1][:, None]
-            q2 = tl.load(rest + 2 * places + q, known, 0.0) - r[2][:, None]
-            square = q0 * q0 + q1 * q1 + q2 * q2
+            square = _squared(rest, places, q, known, r)
             far = square >= apart * apart
             if VIRTUAL:
                 c0 = tl.load(corner + q, known, 0) - tl.load(corner + p, mask, 0)[:, None]
@@ -300,21 +306,12 @@ def _place(
     a = three(d0)
     b = three(d1)
     c = three(d2)
-    f = load3(facing, places, p, mask)
-    a0 = 1 + a[0]
-    b1 = 1 + b[1]
-    c2 = 1 + c[2]
-    n0 = (b1 * c2 - b[2] * c[1]) * f[0] + (c[1] * a[2] - c2 * a[1]) * f[1] + (a[1] * b[2] - a[2] * b1) * f[2]
-    n1 = (b[2] * c[0] - b[0] * c2) * f[0] + (c2 * a0 - c[0] * a[2]) * f[1] + (a[2] * b[0] - a0 * b[2]) * f[2]
-    n2 = (b[0] * c[1] - b1 * c[0]) * f[0] + (c[0] * a[1] - c[1] * a0) * f[1] + (a0 * b1 - a[1] * b[0]) * f[2]
-    length = tl.maximum(tl.sqrt(n0 * n0 + n1 * n1 + n2 * n2), 1e-12)
+    n = matvec(transpose(cofactor(plus_identity(a + b + c))), load3(facing, places, p, mask))
+    length = tl.maximum(tl.sqrt(dot3(n, n)), 1e-12)
     to = row + p * 8
-    for k in tl.static_range(3):
-        tl.store(to + k, x[k], mask)
+    store3(to, 1, 0, x, mask)
     tl.store(to + 3, tl.load(thickness + p, mask, 0.0), mask)
-    tl.store(to + 4, n0 / length, mask)
-    tl.store(to + 5, n1 / length, mask)
-    tl.store(to + 6, n2 / length, mask)
+    store3(to + 4, 1, 0, (n[0] / length, n[1] / length, n[2] / length), mask)
     tl.store(to + 7, tl.load(radius + p, mask, 0.0), mask)
 
 
@@ -328,22 +325,19 @@ def discs(d, a, ra, b, rb):
     also = squared - q * q < rb * rb
     p = tl.where(over, p, 0.0)
     q = tl.where(also, q, 0.0)
-    n = (p * a[0] + q * b[0], p * a[1] + q * b[1], p * a[2] + q * b[2])
+    n = axpy3(p, a, q, b)
     size = tl.sqrt(tl.maximum(dot3(n, n), 1.2e-38))
-    sure = size > 1.1e-19
-    n = (tl.where(sure, n[0] / size, b[0]), tl.where(sure, n[1] / size, b[1]), tl.where(sure, n[2] / size, b[2]))
+    n = where3(size > 1.1e-19, (n[0] / size, n[1] / size, n[2] / size), b)
     return n, over | also
 
 
 @triton.jit
-def _keep(data, other, slots, places, p, many, acts, q, n0, n1, n2, target):
+def _keep(data, other, slots, places, p, many, acts, q, n, target):
     at = many * places + p
     acts = acts & (many < slots)
     tl.store(other + at, q, acts)
     plane = slots * places
-    tl.store(data + at, n0, acts)
-    tl.store(data + plane + at, n1, acts)
-    tl.store(data + 2 * plane + at, n2, acts)
+    store3(data, plane, at, n, acts)
     tl.store(data + 3 * plane + at, target, acts)
     return many + acts.to(tl.int32)
 
@@ -364,18 +358,12 @@ def _constrain_pairs(
     """
     length = tl.load(near + p, mask, 0)
     wide = tl.arange(0, WIDE)[None, :]
-    own = row + p * 8
-    x0 = tl.load(own, mask, 0.0)
-    x1 = tl.load(own + 1, mask, 0.0)
-    x2 = tl.load(own + 2, mask, 0.0)
+    x = vector(row + p * 8, mask)
     close = tl.zeros([BLOCK], tl.int32)
     for k in range(0, tl.max(length), WIDE):  # first those that are close
         known = (k + wide) < length[:, None]
         q = tl.load(candidates + p[:, None] * room + k + wide, known, 0)
-        d0 = tl.load(row + q * 8, known, 0.0) - x0[:, None]
-        d1 = tl.load(row + q * 8 + 1, known, 0.0) - x1[:, None]
-        d2 = tl.load(row + q * 8 + 2, known, 0.0) - x2[:, None]
-        known = known & (d0 * d0 + d1 * d1 + d2 * d2 < limit * limit)
+        known = known & (_squared(row, 1, q * 8, known, x) < limit * limit)
         hit = known.to(tl.int32)
         slot = close[:, None] + tl.cumsum(hit, 1) - hit
         tl.store(other + slot * places + p[:, None], q, known & (slot < slots))
@@ -398,7 +386,7 @@ def _constrain_pairs(
         high = moving + tl.maximum(p, q) * 4
         along = dot3(add3(vector(low, real), -1.0, vector(high, real)), n)
         acts = real & above & (tl.minimum(gap, gap + dt * along) < slack)
-        many = _keep(data, other, slots, places, p, many, acts, q, n[0], n[1], n[2], _target(gap, push, most, dt))
+        many = _keep(data, other, slots, places, p, many, acts, q, n, _target(gap, push, most, dt))
     return many, close
 
 
@@ -410,18 +398,14 @@ def _constrain_walls(
     """Write the constraints of samples close to an obstacle k in this substep; -1 - k stands for the other sample."""
     for wall in range(WALLS):
         at = wall * places + p
-        n0 = tl.load(wall_normal + at * 3, mask, 0.0)
-        n1 = tl.load(wall_normal + at * 3 + 1, mask, 0.0)
-        n2 = tl.load(wall_normal + at * 3 + 2, mask, 0.0)
-        along = (tl.load(moving + p * 4, mask, 0.0) - tl.load(wall_drive + at * 3, mask, 0.0)) * n0
-        along += (tl.load(moving + p * 4 + 1, mask, 0.0) - tl.load(wall_drive + at * 3 + 1, mask, 0.0)) * n1
-        along += (tl.load(moving + p * 4 + 2, mask, 0.0) - tl.load(wall_drive + at * 3 + 2, mask, 0.0)) * n2
+        n = vector(wall_normal + at * 3, mask)
+        along = dot3(add3(vector(moving + p * 4, mask), -1.0, vector(wall_drive + at * 3, mask)), n)
         gap = tl.load(wall_gap + at, mask, 0.0)
         acts = mask & (tl.load(wall_valid + at, mask, 0.0) > 0) & (tl.minimum(gap, gap + dt * along) < slack)
         number = tl.full([BLOCK], -1, tl.int32) - wall
-        many = _keep(data, other, slots, places, p, many, acts, number, n0, n1, n2, _target(gap, push, most, dt))
-        for c in tl.static_range(3):
-            tl.store(pressed + at * 3 + c, tl.zeros([BLOCK], tl.float32), mask)
+        many = _keep(data, other, slots, places, p, many, acts, number, n, _target(gap, push, most, dt))
+        zero = tl.zeros([BLOCK], tl.float32)
+        store3(pressed, 1, at * 3, (zero, zero, zero), mask)
     return many
 
 
@@ -646,16 +630,11 @@ def contact_solve(
             n = first + lane
             mask = n < active_nodes
             at = fields + tl.load(active + n, mask, 0) * 8
-            far = tl.zeros([BLOCK], tl.float32)
-            speed = tl.zeros([BLOCK], tl.float32)
-            for c in tl.static_range(3):
-                u = tl.load(at + c, mask, 0.0) - tl.load(before + n * 3 + c, mask, 0.0)
-                v = tl.load(at + 4 + c, mask, 0.0)
-                far += u * u
-                speed += v * v
+            moved_by = add3(vector(at, mask), -1.0, vector(before + n * 3, mask))
+            v = vector(at + 4, mask)
             share = tl.load(carries + n, mask, 0.0)
-            speed = share * dt * tl.sqrt(speed)
-            moved = tl.maximum(moved, share * tl.sqrt(far) + speed)
+            speed = share * dt * tl.sqrt(dot3(v, v))
+            moved = tl.maximum(moved, share * tl.sqrt(dot3(moved_by, moved_by)) + speed)
             fast = tl.maximum(fast, speed)
         tl.store(peak + pid, tl.max(moved))
         tl.store(peak + MOST_PROGRAMS + pid, tl.max(fast))
@@ -776,10 +755,10 @@ def contact_solve(
                     mask = p < places
                     mask = mask & (tl.load(many + p, mask, 0) > 0)
                     if tl.max(mask.to(tl.int32)) > 0:
-                        for c in range(3 * WALLS):
-                            at = (c // 3 * places + p) * 3 + c % 3
-                            sum_ = tl.load(pressed_sum + at, mask, 0.0) + tl.load(pressed + at, mask, 0.0)
-                            tl.store(pressed_sum + at, sum_, mask)
+                        for wall in range(WALLS):
+                            at = (wall * places + p) * 3
+                            total_now = add3(vector(pressed_sum + at, mask), 1.0, vector(pressed + at, mask))
+                            store3(pressed_sum, 1, at, total_now, mask)
             if pid == 0:
                 tl.store(status + ROUNDS, tl.load(status + ROUNDS) + k)
 
@@ -795,22 +774,17 @@ def obstacle_places(
     """
     k = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = k < places
-    at = position + k * 3
-    x = (tl.load(at, mask, 0.0), tl.load(at + 1, mask, 0.0), tl.load(at + 2, mask, 0.0))
+    x = vector(position + k * 3, mask)
     step = tl.load(first_step) + step_offset
     distance, normal, own = touch(x, numbers, rows, step, mask, SOLIDS, 0)
     distance -= 0.5 * tl.load(thickness + k, mask, 0.0)
     on = tl.where(acts(window, tl.load(time)), 1.0, 0.0) + tl.zeros_like(distance)
-    v = moving + k * 4
-    v0 = tl.load(v, mask, 0.0) - own[0]
-    v1 = tl.load(v + 1, mask, 0.0) - own[1]
-    v2 = tl.load(v + 2, mask, 0.0) - own[2]
-    ahead = distance + tl.load(dt).to(tl.float32) * (v0 * normal[0] + v1 * normal[1] + v2 * normal[2])
+    v = add3(vector(moving + k * 4, mask), -1.0, own)
+    ahead = distance + tl.load(dt).to(tl.float32) * dot3(v, normal)
     close = mask & (tl.minimum(distance, ahead) < slack)
     if tl.max(tl.where(close, on, 0.0)) > 0:
         tl.store(within, 1)
     tl.store(gap + k, distance, mask)
     tl.store(valid + k, on, mask)
-    for c in tl.static_range(3):
-        tl.store(facing + k * 3 + c, normal[c], mask)
-        tl.store(drive + k * 3 + c, own[c], mask)
+    store3(facing, 1, k * 3, normal, mask)
+    store3(drive, 1, k * 3, own, mask)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from gaussian_swaying.geometry.frame import SimFrame
-from gaussian_swaying.geometry.linalg_triton import add3, load3, load9, matmul, matvec, store3, transpose
+from gaussian_swaying.geometry.linalg_triton import add3, load3, load9, matmul, matvec, plus_identity, store3, transpose
 from gaussian_swaying.geometry.patches import deform_and_store
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.kernels.launch import lanes, launch, replaces
@@ -43,8 +43,7 @@ def follow(
         u = add3(matvec(G, load3(arm, 1, 3 * index, mask)), 1.0, u)
     zero = 0 * index
     R = load9(axes, 1, zero, mask)
-    F = matmul(matmul(transpose(R), G), R)  # zero at rest, so that nothing moves there
-    F = (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1)
+    F = plus_identity(matmul(matmul(transpose(R), G), R))  # G is zero at rest, so that nothing moves there
     x = add3(load3(means, 1, 3 * index, mask), per_metre, matvec(transpose(R), u))
     store3(means_out, 1, 3 * index, x, mask)
     deform_and_store(

@@ -9,7 +9,21 @@ Rows of node arrays: displacement and velocity, each in four columns of eight, a
 columns, or eight if boundaries need positions.
 """
 
-from gaussian_swaying.geometry.linalg_triton import add3, axpy9, columns9, load3, scale3, scale9, store3, where3
+from gaussian_swaying.geometry.linalg_triton import (
+    add3,
+    axpy3,
+    axpy9,
+    columns9,
+    load3,
+    plus_identity,
+    rows,
+    scale3,
+    scale9,
+    store3,
+    store9,
+    transpose,
+    where3,
+)
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.damping import kelvin_voigt
 from gaussian_swaying.mpm.dispatch import ROW, pk1
@@ -113,7 +127,7 @@ def motion(
         v, rate, _v = gather(
             fields + 4, node, sx, sy, f, wz, gz, inverse_dx, known, False, table, columns, VIRTUAL, WIDE
         )
-    return u, (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1), v, rate
+    return u, plus_identity(F), v, rate
 
 
 @triton.jit
@@ -197,6 +211,7 @@ def total_particles(
         if POSITION:
             mass = tl.load(material + 3 * count + index, mask, 0.0)
             moved = scale3(mass, u)
+        along = rows(transpose(stress))
         for i in range(3):
             wx, gx = node_weight(f[0], i, inverse_dx)
             for j in tl.static_range(3):
@@ -204,20 +219,14 @@ def total_particles(
                 w = wx * wy
                 ax = gx * wy
                 ay = wx * gy
-                a0 = value[0] * w + stress[0] * ax + stress[1] * ay
-                a1 = value[1] * w + stress[3] * ax + stress[4] * ay
-                a2 = value[2] * w + stress[6] * ax + stress[7] * ay
+                a = add3(add3(scale3(w, value), ax, along[0]), ay, along[1])
                 for k in tl.static_range(3):
                     out = partial + (((i * 3 + j) * 3 + k) * (cells + 1) + cell) * WIDTH
                     gw = gz[k] * w
-                    s0 = tl.sum(wz[k] * a0 + gw * stress[2], 1)
-                    s1 = tl.sum(wz[k] * a1 + gw * stress[5], 1)
-                    s2 = tl.sum(wz[k] * a2 + gw * stress[8], 1)
+                    s = sums(axpy3(wz[k], a, gw, along[2]), 1)
                     if chunk > 0:
-                        s0 += tl.load(out, real, 0.0)
-                        s1 += tl.load(out + 1, real, 0.0)
-                        s2 += tl.load(out + 2, real, 0.0)
-                    store3(out, 1, 0, (s0, s1, s2), real)
+                        s = add3(s, 1.0, vector(out, real))
+                    store3(out, 1, 0, s, real)
                     if IMPLICIT:
                         s3 = tl.sum(wz[k] * (w * resistance), 1)
                         if chunk > 0:
@@ -267,8 +276,8 @@ def total_bend(
     u = vector(fields + tl.load(bent_node + k[:, None] * 27 + o, real, 0) * 8, real)
     for r in range(RANK):
         v = tl.load(curving + (k[:, None] * RANK + r) * 32 + o, known[:, None], 0.0)
-        bent0, bent1, bent2 = sums(scale3(v, u), 1)
-        f = (f[0] - v * bent0[:, None], f[1] - v * bent1[:, None], f[2] - v * bent2[:, None])
+        along = sums(scale3(v, u), 1)
+        f = add3(f, -v, (along[0][:, None], along[1][:, None], along[2][:, None]))
     store3(out, 1, 0, f, real)
 
 
@@ -431,15 +440,13 @@ def total_read(
     if WORK:
         zero = f[0] * 0
         account((zero, zero, zero), zero, v, 0.0, tl.load(kick_before), IMPLICIT, load, count, index, mask)
-    F = (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1)
+    F = plus_identity(F)
     if SHEETS:
         F = _in_plane_stress(F, material, normals, count, index, mask)
-    for k in tl.static_range(3):
-        tl.store(position_out + where * 3 + k, tl.load(rest + where * 3 + k, mask, 0.0) + u[k], mask)
-        tl.store(velocity_out + where * 3 + k, v[k], mask)
-    for k in tl.static_range(9):
-        tl.store(F_out + where * 9 + k, F[k], mask)
-        tl.store(affine_out + where * 9 + k, rate[k], mask)
+    store3(position_out, 1, where * 3, add3(load3(rest, 1, where * 3, mask), 1.0, u), mask)
+    store3(velocity_out, 1, where * 3, v, mask)
+    store9(F_out, 1, where * 9, F, mask)
+    store9(affine_out, 1, where * 9, rate, mask)
 
 
 @triton.jit(do_not_specialize=VARIES)
@@ -456,7 +463,7 @@ def total_look(
         node = tl.load(cell_node + node, mask, 0)
     wz, gz = axis_weights(f[2], inverse_dx)
     _u, F, _v = gather(fields, node, sx, sy, f, wz, gz, inverse_dx, mask, False, cell_nodes, cells, VIRTUAL)
-    F = (F[0] + 1, F[1], F[2], F[3], F[4] + 1, F[5], F[6], F[7], F[8] + 1)
+    F = plus_identity(F)
     if SHEETS:
         F = _in_plane_stress(F, material, normals, count, index, mask)
     mu = tl.load(material + count + index, mask, 0.0)

@@ -10,16 +10,20 @@ drag.
 
 from gaussian_swaying.geometry.linalg_triton import (
     add3,
+    axpy3,
     axpy9,
     columns9,
     dot3,
     load3,
     load9,
     matmul,
+    plus_identity,
+    scale3,
     scale9,
     store3,
     store9,
     transpose,
+    where3,
 )
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.mpm.colliders import acts, stop_nodes
@@ -163,14 +167,13 @@ def updated_particles(
         mz = (-fz * wz[0] * dx, (1 - fz) * wz[1] * dx, (2 - fz) * wz[2] * dx)
         v, C, L = _gather_affine(velocity, node, sx, sy, (fx, fy, fz), wz, gz, mz, inverse_dx, dx, inside, WIDE=WIDE)
         C = scale9(4 * inverse_dx * inverse_dx, C)
-        U = (1 + dt * L[0], dt * L[1], dt * L[2], dt * L[3], 1 + dt * L[4], dt * L[5], dt * L[6], dt * L[7],
-             1 + dt * L[8])  # fmt: skip
+        U = plus_identity(scale9(dt, L))
         F = matmul(U, F)
         if PLASTIC:
             F_total = matmul(U, F_total)
         else:
             F_total = F
-        x = (x[0] + dt * v[0], x[1] + dt * v[1], x[2] + dt * v[2])
+        x = add3(x, dt, v)
         lost = tl.load(moving + 24 * count + index, mask, 0.0)
         tl.store(moving + 24 * count + index, tl.where(inside, lost, 1.0), mask)
         if PLASTIC or SCATTER:
@@ -208,15 +211,10 @@ def updated_particles(
         node = tl.where(inside, first, -1)
         wz, gz = axis_weights(fz, inverse_dx)
         pull = -kick * volume
+        push = force
         if IMPLICIT:
-            value = (
-                mass * v[0] + kick * (force[0] + resistance * v[0]),
-                mass * v[1] + kick * (force[1] + resistance * v[1]),
-                mass * v[2] + kick * (force[2] + resistance * v[2]),
-                mass,
-            )
-        else:
-            value = (mass * v[0] + kick * force[0], mass * v[1] + kick * force[1], mass * v[2] + kick * force[2], mass)
+            push = add3(force, resistance, v)
+        value = axpy3(mass, v, kick, push) + (mass,)
         # factor of w (x_i - x_p), and factor of the gradient of w
         moment = scale9(mass, C)
         slope = scale9(pull, stress)
@@ -424,11 +422,7 @@ def updated_nodes(
         yielding = 1.0 / (1 + kick * tl.load(row + 4, mask, 0.0) * inverse)
         push = push * yielding
         share = inverse * yielding
-    v = (
-        (tl.load(row, mask, 0.0) * share + push * gravity_x) * decay,
-        (tl.load(row + 1, mask, 0.0) * share + push * gravity_y) * decay,
-        (tl.load(row + 2, mask, 0.0) * share + push * gravity_z) * decay,
-    )
+    v = scale3(decay, axpy3(share, vector(row, mask), push, (gravity_x, gravity_y, gravity_z)))
     if len(TURNS) > 0:
         now = tl.load(clock) + step * tl.load(clock + 1)
         own = k
@@ -445,7 +439,7 @@ def updated_nodes(
                 SOLIDS, TURNS[n][1], KINDS,
             )  # fmt: skip
             hit = tl.where(acts(window, now), behind & some & mask, False)
-            u = (tl.where(hit, held[0], v[0]), tl.where(hit, held[1], v[1]), tl.where(hit, held[2], v[2]))
+            u = where3(hit, held, v)
             if tl.sum(hit.to(tl.int32)) > 0:  # few blocks touch a solid
                 first = tl.program_id(0) * BLOCK // scene_nodes
                 last = first

@@ -113,7 +113,7 @@ def drawable(snapshot: Snapshot) -> bool:
     shader = snapshot.simulation.painter.shader
     with turn(snapshot.simulation):
         has_nodes = snapshot.simulation.scene.follow.nodes(snapshot.state) is not None
-    return has_nodes and (shader is None or (isinstance(shader, DiffuseShader) and not shader.specular))
+    return has_nodes and (shader is None or isinstance(shader, DiffuseShader))
 
 
 @torch.inference_mode()

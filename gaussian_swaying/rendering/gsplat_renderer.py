@@ -14,11 +14,11 @@ import torch
 from filelock import FileLock, Timeout
 from torch import Tensor, _appdirs, nn
 
-from gaussian_swaying._checks import check_positive
 from gaussian_swaying._files import write_text
 from gaussian_swaying.gaussians.harmonics import sh_degree
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.protocol import (
+    BLUR,
     RenderOutput,
     ScreenGaussians,
     SplatOutput,
@@ -139,7 +139,6 @@ def render_gsplat(
     colors: Tensor,
     camera: Camera,
     background: Tensor | None = None,
-    eps2d: float = 0.3,
 ) -> RenderOutput:
     """Draw Gaussians as ``gsplat.rasterization`` (Ye et al. 2025, arXiv 2409.06765) does, in float32.
 
@@ -177,7 +176,7 @@ def render_gsplat(
         view.intrinsics[None],
         camera.width,
         camera.height,
-        eps2d=eps2d,
+        eps2d=BLUR,
         near_plane=camera.near,
         opacities=opacities,  # for a tighter radius
     )
@@ -197,7 +196,6 @@ def rasterize_splat(
     sh: Tensor,
     camera: Camera,
     background: Tensor | None = None,
-    eps2d: float = 0.3,
     channels: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, ScreenGaussians]:
     """``gsplat.rasterization`` for one camera, built from gsplat's functions.
@@ -226,7 +224,7 @@ def rasterize_splat(
         camera.intrinsics[None],
         camera.width,
         camera.height,
-        eps2d=eps2d,
+        eps2d=BLUR,
         near_plane=camera.near,
         packed=False,
         opacities=opacities,  # for a tighter radius
@@ -275,20 +273,14 @@ def _compose(pixels: Tensor, alpha: Tensor, background: Tensor | None, dtype: to
 class GsplatRenderer(nn.Module):
     """Renderer for CUDA devices, see :func:`render_gsplat`.
 
-    Args:
-        eps2d: Added to the diagonal of the projected covariances [pixels^2].
-
     Raises:
         RuntimeError: If there is no CUDA device.
-        ValueError: If ``eps2d`` is negative.
     """
 
-    def __init__(self, eps2d: float = 0.3) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        check_positive("eps2d", eps2d, allow_zero=True)
         if not torch.cuda.is_available():
             raise RuntimeError("GsplatRenderer needs CUDA, but torch finds no CUDA device: use TorchRenderer instead.")
-        self.eps2d = float(eps2d)
 
     def forward(
         self,
@@ -300,7 +292,7 @@ class GsplatRenderer(nn.Module):
         background: Tensor | None = None,
     ) -> RenderOutput:
         """Render one picture, see :class:`~gaussian_swaying.rendering.protocol.Renderer`."""
-        return render_gsplat(means, covariances, opacities, colors, camera, background, self.eps2d)
+        return render_gsplat(means, covariances, opacities, colors, camera, background)
 
     def render_splat(
         self,
@@ -321,7 +313,7 @@ class GsplatRenderer(nn.Module):
         if means.device.type != "cuda":
             raise RuntimeError(f"GsplatRenderer needs tensors on a CUDA device, but `means` is on {means.device}.")
         view = camera.to(means.device, torch.float32)
-        given = (means, quats, log_scales.exp(), opacities, sh, view, background, self.eps2d, channels)
+        given = (means, quats, log_scales.exp(), opacities, sh, view, background, channels)
         pixels, alpha, screen = rasterize_splat(*given)
         if channels is None:
             return SplatOutput(pixels[0], alpha[0], screen)

@@ -11,6 +11,8 @@ from gaussian_swaying._checks import check_shape
 from gaussian_swaying._fixed import fixed
 from gaussian_swaying.rendering.cameras.camera import Camera
 
+BLUR = 0.3
+"""Added to the diagonal of projected covariances [pixels^2]."""
 MIN_ALPHA = 1.0 / 255.0
 """A Gaussian is skipped at pixels where its alpha is smaller."""
 MAX_ALPHA = 0.999

@@ -13,7 +13,7 @@ from torch import Tensor
 from gaussian_swaying.kernels.language import INTERPRETED, triton
 from gaussian_swaying.kernels.launch import LANES, compiles, launch
 from gaussian_swaying.rendering.cameras.camera import Camera
-from gaussian_swaying.rendering.protocol import RenderOutput
+from gaussian_swaying.rendering.protocol import BLUR, RenderOutput
 from gaussian_swaying.rendering.raster_kernels import (
     HEIGHT,
     ROW,
@@ -52,7 +52,6 @@ def render(
     colors: Tensor,
     camera: Camera,
     background: Tensor | None,
-    eps2d: float,
     detail: float = 0.0,
 ) -> RenderOutput | None:
     """Draw Gaussians as ``render_torch``, thinned if there is a detail, from float32 on a CPU, without gradients.
@@ -71,7 +70,7 @@ def render(
     given = [tensor.detach().contiguous() for tensor in (means, covariances, opacities, colors)]
     view = [camera.world_to_camera.reshape(-1), camera.intrinsics.reshape(-1)]
     numbers = torch.cat(
-        [*(part.detach().cpu().double() for part in view), torch.tensor([camera.near, eps2d, detail**2]).double()]
+        [*(part.detach().cpu().double() for part in view), torch.tensor([camera.near, BLUR, detail**2]).double()]
     )
     rows = torch.empty(count, ROW // 2, dtype=torch.float64)
     depths, boxes = torch.empty(count, dtype=torch.float64), torch.empty(count, 4, dtype=torch.int32)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying.rendering.cameras.camera import Camera
+from gaussian_swaying.rendering.protocol import BLUR
 
 DETAIL = 1 / 3
 """Size [pixels] below which Gaussians are thinned in previews and on the live page."""
@@ -25,7 +26,6 @@ def thinned(
     colors: Tensor,
     camera: Camera,
     detail: float = DETAIL,
-    eps2d: float = 0.3,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     r"""A random subset of the Gaussians that looks like all of them.
 
@@ -56,6 +56,6 @@ def thinned(
     if len(index) == len(means):
         return means, covariances, opacities, colors
     share, size2, opacity = share[index], size2[index], opacities[index]
-    grown = (eps2d + size2 / share + 1e-30) / (eps2d + size2 + 1e-30)
+    grown = (BLUR + size2 / share + 1e-30) / (BLUR + size2 + 1e-30)
     opacity = torch.where(share < 1, 1 - (1 - opacity).clamp_min(1e-7) ** (1 / (share * grown)), opacity)
     return means[index], covariances[index] / share[:, None, None], opacity, colors[index]

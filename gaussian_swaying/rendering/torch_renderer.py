@@ -20,6 +20,7 @@ from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.rendering import raster
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.protocol import (
+    BLUR,
     MAX_ALPHA,
     MIN_ALPHA,
     MIN_TRANSMITTANCE,
@@ -31,6 +32,9 @@ from gaussian_swaying.rendering.protocol import (
     finite_gaussians,
 )
 from gaussian_swaying.rendering.thinning import thinned
+
+PAIRS = 1 << 18
+"""About how many pairs of a Gaussian and a pixel are in memory at a time; autograd keeps them all."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,9 +56,7 @@ class ProjectedGaussians:
     log_opacities: Tensor
 
 
-def project_gaussians(
-    means: Tensor, covariances: Tensor, opacities: Tensor, camera: Camera, eps2d: float = 0.3
-) -> ProjectedGaussians:
+def project_gaussians(means: Tensor, covariances: Tensor, opacities: Tensor, camera: Camera) -> ProjectedGaussians:
     r"""Project Gaussians to the image with the local affine approximation of the perspective.
 
     With camera points :math:`(x, y, z)`, the world-to-camera rotation :math:`W` and :math:`\hat x = x / z`,
@@ -88,9 +90,9 @@ def project_gaussians(
     row_y = (fy / z)[:, None] * (rotation[1] - y_hat[:, None] * rotation[2])
     sigma_x = (covariances @ row_x[..., None]).squeeze(-1)
     sigma_y = (covariances @ row_y[..., None]).squeeze(-1)
-    xx = (row_x * sigma_x).sum(-1) + eps2d
+    xx = (row_x * sigma_x).sum(-1) + BLUR
     xy = (row_x * sigma_y).sum(-1)
-    yy = (row_y * sigma_y).sum(-1) + eps2d
+    yy = (row_y * sigma_y).sum(-1) + BLUR
     means2d = torch.stack([fx * x_ratio + cx, fy * y_ratio + cy], -1)
     covariances2d = torch.stack([xx, xy, yy], -1)
     log_opacities = opacities.log()
@@ -115,10 +117,10 @@ def _extent(covariances2d: Tensor, log_opacities: Tensor) -> Tensor:
     return (reach[:, None] * covariances2d[:, [0, 2]]).sqrt() + SLACK
 
 
-def _blocks(counts: Tensor, limit: int) -> tuple[Tensor, list[tuple[int, int]]]:
+def _blocks(counts: Tensor) -> tuple[Tensor, list[tuple[int, int]]]:
     running = counts.cumsum(0)
     total = int(running[-1]) if len(running) else 0
-    marks = torch.arange(limit, total + limit, limit, device=counts.device)
+    marks = torch.arange(PAIRS, total + PAIRS, PAIRS, device=counts.device)
     ends = [0, *(torch.searchsorted(running, marks).clamp_max(len(running) - 1) + 1).tolist()] if total else []
     return running, [(start, end) for start, end in pairwise(ends) if end > start]
 
@@ -138,8 +140,8 @@ class _Spans:
     curvature: Tensor
 
 
-def _row_spans(projected: ProjectedGaussians, width: int, height: int, limit: int) -> Iterator[_Spans]:
-    r"""Split each Gaussian into the rows it covers, about ``limit`` rows at a time.
+def _row_spans(projected: ProjectedGaussians, width: int, height: int) -> Iterator[_Spans]:
+    r"""Split each Gaussian into the rows it covers, about ``PAIRS`` rows at a time.
 
     In the row at height dy over the centre, the exponent of the Gaussian splits into a square in x and a rest,
 
@@ -159,7 +161,7 @@ def _row_spans(projected: ProjectedGaussians, width: int, height: int, limit: in
         center = projected.means2d[:, 1] - 0.5
         first = (center - reach).ceil().clamp(0, height).long()
         rows = ((center + reach).floor().clamp(-1, height - 1).long() - first + 1).clamp_min(0)
-        running, blocks = _blocks(rows, limit)
+        running, blocks = _blocks(rows)
         shift = first - running + rows
     for start, end in blocks:
         with torch.no_grad():
@@ -178,7 +180,7 @@ def _row_spans(projected: ProjectedGaussians, width: int, height: int, limit: in
 
 
 def composite_gaussians(
-    projected: ProjectedGaussians, features: Tensor, width: int, height: int, max_pairs: int = 1 << 18
+    projected: ProjectedGaussians, features: Tensor, width: int, height: int
 ) -> tuple[Tensor, Tensor]:
     r"""Blend projected Gaussians from front to back.
 
@@ -192,7 +194,6 @@ def composite_gaussians(
 
     Args:
         features: Values to blend, shape (V, D).
-        max_pairs: Approximate number of pairs of a Gaussian and a pixel in memory at a time (autograd keeps them all).
 
     Returns:
         Blended features, shape (H, W, D), and opacity :math:`\sum_k T_k \alpha_k`, shape (H, W, 1).
@@ -203,8 +204,8 @@ def composite_gaussians(
     log_transmittance = torch.zeros(pixel_count, dtype=torch.float64, device=features.device)
     features = torch.cat([features, torch.ones_like(features[:, :1])], -1)
     started = False
-    for spans in _row_spans(projected, width, height, max_pairs):
-        running, blocks = _blocks(spans.count, max_pairs)
+    for spans in _row_spans(projected, width, height):
+        running, blocks = _blocks(spans.count)
         before = running - spans.count
         for start, end in blocks:
             with torch.no_grad():
@@ -253,15 +254,10 @@ def render_torch(
     colors: Tensor,
     camera: Camera,
     background: Tensor | None = None,
-    eps2d: float = 0.3,
-    max_pairs: int = 1 << 18,
 ) -> RenderOutput:
     """Draw Gaussians, see :func:`project_gaussians` and :func:`composite_gaussians`.
 
     Differentiable with respect to ``means``, ``covariances``, ``opacities``, ``colors`` and ``background``.
-
-    Args:
-        max_pairs: Approximate number of pairs of a Gaussian and a pixel in memory at a time.
 
     Returns:
         The picture, on the device and in the precision of ``means``.
@@ -269,9 +265,9 @@ def render_torch(
     check_gaussians(means, covariances, opacities, colors, background)
     camera = camera.to(means.device, means.dtype)
     opacities = torch.where(finite_gaussians(means, covariances, opacities, colors), opacities, 0.0)
-    projected = project_gaussians(means, covariances, opacities, camera, eps2d)
+    projected = project_gaussians(means, covariances, opacities, camera)
     features = torch.cat([colors[projected.index], projected.depths[:, None]], -1)
-    blended, alpha = composite_gaussians(projected, features, camera.width, camera.height, max_pairs)
+    blended, alpha = composite_gaussians(projected, features, camera.width, camera.height)
     color = blended[..., :3]
     if background is not None:
         color = color + (1.0 - alpha) * background.to(color)
@@ -285,22 +281,17 @@ class TorchRenderer(nn.Module):
     (:mod:`~gaussian_swaying.rendering.raster`), if llvmlite is installed.
 
     Args:
-        eps2d: Added to the diagonal of the projected covariances [pixels^2].
-        max_pairs: Approximate number of pairs of a Gaussian and a pixel in memory at a time; bounds the memory and does
-            not change the picture beyond round-off. The kernels do not need it.
         detail: Size [pixels] below which Gaussians are thinned, 0 for none
             (:func:`~gaussian_swaying.rendering.thinning.thinned`). Training always draws all.
 
     Raises:
-        ValueError: If ``eps2d`` or ``detail`` is negative or ``max_pairs`` is not positive.
+        ValueError: If ``detail`` is negative.
     """
 
-    def __init__(self, eps2d: float = 0.3, max_pairs: int = 1 << 18, detail: float = 0.0) -> None:
+    def __init__(self, detail: float = 0.0) -> None:
         super().__init__()
         check_positive("detail", detail, allow_zero=True)
-        check_positive("eps2d", eps2d, allow_zero=True)
-        check_positive("max_pairs", max_pairs)
-        self.eps2d, self.max_pairs, self.detail = float(eps2d), int(max_pairs), float(detail)
+        self.detail = float(detail)
 
     def forward(
         self,
@@ -319,12 +310,12 @@ class TorchRenderer(nn.Module):
             t for t in (background, camera.world_to_camera, camera.intrinsics) if t is not None and t.requires_grad
         ]
         if raster.runs(given) and not (wanted and torch.is_grad_enabled()):
-            picture = raster.render(*given, camera, background, self.eps2d, self.detail)
+            picture = raster.render(*given, camera, background, self.detail)
             if picture is not None:
                 return picture
         if self.detail > 0:
-            given = thinned(*given, camera.to(means.device, means.dtype), self.detail, self.eps2d)
-        return render_torch(*given, camera, background, self.eps2d, self.max_pairs)
+            given = thinned(*given, camera.to(means.device, means.dtype), self.detail)
+        return render_torch(*given, camera, background)
 
     def render_splat(
         self,
@@ -342,10 +333,10 @@ class TorchRenderer(nn.Module):
         # after the projection, so that only visible Gaussians get a colour
         covariances = covariance(quats, log_scales)
         finite = finite_gaussians(means, covariances, opacities, sh.flatten(1))
-        projected = project_gaussians(means, covariances, torch.where(finite, opacities, 0.0), camera, self.eps2d)
+        projected = project_gaussians(means, covariances, torch.where(finite, opacities, 0.0), camera)
         colors = sh_to_color(sh[projected.index], means[projected.index] - camera.position)
         values = colors if channels is None else torch.cat([colors, channels[projected.index]], dim=-1)
-        blended, alpha = composite_gaussians(projected, values, camera.width, camera.height, self.max_pairs)
+        blended, alpha = composite_gaussians(projected, values, camera.width, camera.height)
         color = blended[..., :3]
         if background is not None:
             color = color + (1.0 - alpha) * background.to(color)

@@ -194,8 +194,8 @@ class Painter(Fixed, nn.Module):
         if len(means) > RECORDED and not scene.all_move:
             still, harmonics = self._still_colours(camera, eye)
             turned = gaussians.rotations[index] if scene.model.view_dependent else None
-            view, colours = seen_from(harmonics, eye, means[index], turned)
-            return still.index_copy(0, index, self._shaded(colours, gaussians.normals[index], view))
+            colours = seen_from(harmonics, eye, means[index], turned)
+            return still.index_copy(0, index, self._shaded(colours, gaussians.normals[index]))
         given = [eye, means, gaussians.normals]
         given += [gaussians.rotations] if scene.model.view_dependent else []
         if len(means) > RECORDED or not (shader is None or shader.recordable):
@@ -205,19 +205,18 @@ class Painter(Fixed, nn.Module):
 
     def _colors(self, eye: Tensor, means: Tensor, normals: Tensor, rotations: Tensor | None = None) -> Tensor:
         scene, index = self.scene, self.scene.moving
-        view, colours = seen_from(scene.model.sh, eye, means, rotations)
+        colours = seen_from(scene.model.sh, eye, means, rotations)
         if scene.all_move:
-            return self._shaded(colours, normals, view)
+            return self._shaded(colours, normals)
         if self.shader is None:
             return colours
-        return colours.index_copy(0, index, self._shaded(colours[index], normals[index], view[index]))
+        return colours.index_copy(0, index, self._shaded(colours[index], normals[index]))
 
-    def _shaded(self, colours: Tensor, normals: Tensor, view: Tensor) -> Tensor:
+    def _shaded(self, colours: Tensor, normals: Tensor) -> Tensor:
         if self.shader is None:
             return colours
         scene = self.scene
-        normal, to_eye = (scene.frame.direction_to_sim(part) for part in (normals, -view))
-        return self.shader(colours, normal, rest_normal=scene.rest_facing, view_direction=to_eye)
+        return self.shader(colours, scene.frame.direction_to_sim(normals), rest_normal=scene.rest_facing)
 
     def _still_colours(self, camera: Camera, eye: Tensor) -> tuple[Tensor, Tensor]:
         """Colours (N, 3) of all Gaussians at rest, and the harmonics of those that move; kept for the last camera.
@@ -292,11 +291,11 @@ def draw(
     return known[2].picture(known[2].deformed(state), camera.to(means.device, means.dtype))
 
 
-def seen_from(sh: Tensor, eye: Tensor, means: Tensor, rotations: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Directions from the eye, and colours seen along them in each Gaussian's rest frame, both (N, 3)."""
+def seen_from(sh: Tensor, eye: Tensor, means: Tensor, rotations: Tensor | None) -> Tensor:
+    """Colours as seen from an eye in each Gaussian's rest frame, shape (N, 3)."""
     view = torch.nn.functional.normalize(means - eye, dim=-1)
     at_rest = view if rotations is None else (view[..., None] * rotations).sum(-2)
-    return view, sh_to_color(sh, at_rest)
+    return sh_to_color(sh, at_rest)
 
 
 class CopiesPainter(Painter):
@@ -377,8 +376,8 @@ class CopiesPainter(Painter):
         for number, (means, normals, rotations) in enumerate(groups):
             moves = number % 2 == 0
             turned = rotations if model.view_dependent else None
-            view, colours = seen_from(moving if moves else held, eye, means, turned)
-            found.append(self._shaded(colours, normals, view) if moves else colours)
+            colours = seen_from(moving if moves else held, eye, means, turned)
+            found.append(self._shaded(colours, normals) if moves else colours)
         return torch.cat(found)
 
     def opacity(self) -> Tensor:

@@ -30,15 +30,15 @@ def _scene(count=300, seed=3, size=0.08):
     return means, factors @ factors.mT, opacities, torch.rand(count, 3, generator=generator)
 
 
-def _agree(scene, camera, background=BACKGROUND, eps2d=0.3):
-    made = raster.render(*scene, camera, background, eps2d)
+def _agree(scene, camera, background=BACKGROUND):
+    made = raster.render(*scene, camera, background)
     double = [part.double() for part in scene]
     pictures = []
     for change in (0.0, 1e-5, -1e-5):
         with pytest.MonkeyPatch.context() as patch:
             for name, times in (("MIN_ALPHA", 1), ("MIN_TRANSMITTANCE", 10)):
                 patch.setattr(torch_renderer, name, getattr(torch_renderer, name) * (1 + times * change))
-            pictures.append(render_torch(*double, camera, background.double(), eps2d))
+            pictures.append(render_torch(*double, camera, background.double()))
     far = float(pictures[0].depth.max().clamp_min(1.0))
     for name, limit in (("color", 1e-5), ("alpha", 1e-5), ("depth", 1e-5 * far)):
         found = getattr(made, name)
@@ -121,10 +121,10 @@ def test_any_three_values():
     _agree((means, covariances, opacities, colors[:, :1].expand(-1, 3)), _camera())
 
 
-def test_blur_and_background():
+def test_background():
     scene, camera = _scene(), _camera()
-    made = _agree(scene, camera, eps2d=2.0)
-    black = raster.render(*scene, camera, None, 2.0)
+    made = _agree(scene, camera)
+    black = raster.render(*scene, camera, None)
     near(made.color, black.color + (1 - black.alpha) * BACKGROUND, 1e-6)
 
 

@@ -53,7 +53,7 @@ def test_one_covers_for_those_that_are_left_out():
     """Area, optical depth and the blur of the renderer, by the formulas of the docstring, in float64."""
     given = _cloud(2_000, 0.1, dtype=torch.float64)
     given[0][:, 1] = 0  # all at one depth
-    _, shapes, opacities, colours = thinned(*given, _camera(torch.float64), 1 / 3, 0.3)
+    _, shapes, opacities, colours = thinned(*given, _camera(torch.float64), 1 / 3)
     share, size2 = 0.09, 0.01
     torch.testing.assert_close(shapes[0], given[1][0] / share, rtol=1e-4, atol=0.0)
     grown = (0.3 + size2 / share) / (0.3 + size2)
@@ -101,7 +101,7 @@ def test_kernels_thin_as_the_definition(opacity):
     given = list(_cloud(3_000, 0.1, opacity))
     given[1] = given[1] * torch.logspace(-2, 3, 3_000)[:, None, None]
     camera = _camera()
-    made = raster.render(*given, camera, BACKGROUND, 0.3, 0.5)
+    made = raster.render(*given, camera, BACKGROUND, 0.5)
     double = [part.double() for part in given]
     some = thinned(*double, _camera(torch.float64), 0.5)
     assert 0.3 < len(some[0]) / 3_000 < 0.9
@@ -110,5 +110,5 @@ def test_kernels_thin_as_the_definition(opacity):
     assert (errors < 2e-5).double().mean() > 0.999
     assert errors.max() < 0.01
     assert torch.equal(
-        raster.render(*given, camera, BACKGROUND, 0.3).color, TorchRenderer()(*given, camera, BACKGROUND).color
+        raster.render(*given, camera, BACKGROUND).color, TorchRenderer()(*given, camera, BACKGROUND).color
     )

@@ -7,6 +7,7 @@ from small_scenes import varied_cloud
 
 from gaussian_swaying.gaussians.harmonics import sh_to_color
 from gaussian_swaying.geometry import covariances
+from gaussian_swaying.rendering import torch_renderer
 from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera, project
 from gaussian_swaying.rendering.protocol import finite_gaussians
 from gaussian_swaying.rendering.torch_renderer import TorchRenderer, project_gaussians, render_torch
@@ -41,7 +42,7 @@ def _scene(count=40, dtype=torch.float64, device="cpu"):
     return tuple(item.to(device, dtype) for item in (means, covariances, opacities, colors))
 
 
-def _oracle(means, covariances, opacities, colors, camera, background, eps2d=0.3):
+def _oracle(means, covariances, opacities, colors, camera, background):
     (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
     rotation, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
     tan_x, tan_y = camera.width / (2 * fx), camera.height / (2 * fy)
@@ -53,7 +54,7 @@ def _oracle(means, covariances, opacities, colors, camera, background, eps2d=0.3
         u = min((camera.width - cx) / fx + 0.3 * tan_x, max(-cx / fx - 0.3 * tan_x, x / z))
         v = min((camera.height - cy) / fy + 0.3 * tan_y, max(-cy / fy - 0.3 * tan_y, y / z))
         jacobian = double([[fx / z, 0, -fx * u / z], [0, fy / z, -fy * v / z]])
-        image = jacobian @ rotation @ covariance @ rotation.T @ jacobian.T + eps2d * torch.eye(2).double()
+        image = jacobian @ rotation @ covariance @ rotation.T @ jacobian.T + 0.3 * torch.eye(2).double()
         splats.append((z, fx * x / z + cx, fy * y / z + cy, torch.linalg.inv(image).tolist(), opacity, color))
     splats.sort(key=lambda splat: splat[0])
     color_image = torch.zeros(camera.height, camera.width, 3).double()
@@ -108,9 +109,11 @@ def test_projection_is_sorted_and_keeps_what_is_seen():
     assert {0, 7, 13} <= kept
 
 
-@pytest.mark.parametrize("max_pairs", [1, 7, 100, 1 << 20])
-def test_memory_limit_does_not_change_the_picture(max_pairs):
-    expected, result = render_torch(*_scene(), _camera()), TorchRenderer(max_pairs=max_pairs)(*_scene(), _camera())
+@pytest.mark.parametrize("pairs", [1, 7, 100, 1 << 20])
+def test_memory_limit_does_not_change_the_picture(pairs, monkeypatch):
+    expected = render_torch(*_scene(), _camera())
+    monkeypatch.setattr(torch_renderer, "PAIRS", pairs)
+    result = TorchRenderer()(*_scene(), _camera())
     for name in ("color", "alpha", "depth"):
         near(getattr(result, name), getattr(expected, name), 1e-12)
 
@@ -154,7 +157,8 @@ def test_bad_gaussians_do_not_poison_the_picture():
     assert render_torch(*huge, _camera()).color.isfinite().all()
 
 
-def test_gradcheck():
+def test_gradcheck(monkeypatch):
+    monkeypatch.setattr(torch_renderer, "PAIRS", 300)
     means, covariances, opacities, colors = (item[[20, 21, 22, 23]].clone() for item in _scene())
     means *= 0.4  # inside the image
     factors = torch.linalg.cholesky(covariances + 0.02 * EYE)
@@ -164,7 +168,7 @@ def test_gradcheck():
         item.requires_grad_()
 
     def render(means, factors, opacities, colors, background):
-        result = render_torch(means, factors @ factors.mT, opacities, colors, _camera(), background, max_pairs=300)
+        result = render_torch(means, factors @ factors.mT, opacities, colors, _camera(), background)
         return result.color[::4, ::4], result.alpha[::4, ::4], result.depth[::4, ::4]
 
     assert all(float(output.detach().std()) > 0.01 for output in render(*inputs))

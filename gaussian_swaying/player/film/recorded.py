@@ -153,10 +153,8 @@ def film_of(simulation: Simulation, grid: GridSpec, nodes: Tensor, displacement:
     color = sh_to_color(scene.model.sh0, torch.ones(count, 3, device=device))
     color = torch.cat([color, scene.model.opacity()[:, None]], dim=-1)
     shader, notes = painter.shader, []
-    if shader is not None and (not isinstance(shader, DiffuseShader) or shader.specular):
-        notes.append(
-            f"the film has no highlight of the {type(shader).__name__}: the Gaussians keep the colours of the splat."
-        )
+    if not (shader is None or isinstance(shader, DiffuseShader)):
+        notes.append(f"the film has no {type(shader).__name__}: the Gaussians keep the colours of the splat.")
     if scene.model.view_dependent:
         notes.append("colours that depend on the direction of view are the same from all sides.")
     head = {
@@ -274,7 +272,7 @@ def spread(position: Tensor, first: int = 1) -> Tensor:
 def look_of(painter: Painter) -> dict[str, Any]:
     """Light and background for the page; the light is None without a :class:`DiffuseShader`."""
     shader, light = painter.shader, None
-    if isinstance(shader, DiffuseShader) and not shader.specular:
+    if isinstance(shader, DiffuseShader):
         light = {"light": shader.light.tolist(), "two_sided": shader.two_sided, "ambient": shader.ambient}
         light["relative"] = shader.relative
     return {"shader": light, "background": painter.background.tolist()}
