@@ -23,6 +23,9 @@ ORDER = 2
 """Order of the solver in the size of a cell (docs/accuracy.md); in the substep it is 1."""
 SAFETY = 3.0
 """Factor of an error from two grids (Roache 1994, the grid convergence index)."""
+MODEL = 0.05
+"""Share of the motion by which careful solvers of the same thing differ, so that 9 of 10 frames of Blender's flags and
+Newton's posts are within the error (``coverage`` of tools/bench.py)."""
 APART = 0.25
 """Two motions are apart when their distance is this share of the motion."""
 MOST = 2000  # Gaussians that are compared
@@ -185,7 +188,8 @@ def error_of(motions: Sequence[Tensor], substeps: Sequence[int], frame_dt: float
     """The error of a motion, from one on a coarser grid and one there with other substeps.
 
     The error of the grid is Roache's for two grids, ``SAFETY d / (COARSER^ORDER - 1)``; that of the substeps is linear
-    in them. From the frame on in which two motions are :data:`APART`, their distance says nothing of the error.
+    in them. No run tells the error of the model; :data:`MODEL` stands for it. The three are added as independent ones.
+    From the frame on in which two motions are :data:`APART`, their distance says nothing of the error.
 
     Args:
         motions: Displacements [m], shape (frames, N, 3): of the run, on cells :data:`COARSER` times as large, and there
@@ -194,8 +198,8 @@ def error_of(motions: Sequence[Tensor], substeps: Sequence[int], frame_dt: float
         frame_dt: Time between frames [s].
 
     Returns:
-        Root mean squares over the points in each frame [m]: ``error_m``, its parts ``grid_m`` and ``substep_m``, and
-        the distance from rest ``motion_m``. ``trusted_s`` is the time up to which the error holds; ``chaos_s`` that
+        Root mean squares over the points in each frame [m]: ``error_m``, its parts ``grid_m``, ``substep_m`` and
+        ``model_m``, and the distance from rest ``motion_m``. ``trusted_s`` is the time up to which the error holds; ``chaos_s`` that
         from which other substeps alone make another motion, or None; ``size_m`` the motion about its mean; and a
         sentence.
     """
@@ -206,7 +210,9 @@ def error_of(motions: Sequence[Tensor], substeps: Sequence[int], frame_dt: float
     apart = _rms(coarse - other)
     grid = SAFETY * _rms(run - coarse) / (COARSER**ORDER - 1)
     substep = SAFETY * apart * (1 / steps[0]) / between if between > 0 else torch.zeros_like(apart)
-    error = (grid.square() + substep.square()).sqrt()
+    motion = _rms(run)
+    model = MODEL * motion
+    error = (grid.square() + substep.square() + model.square()).sqrt()
     chaos, first = (
         next((k for k in range(len(run)) if max(one[k] for one in distances) > APART * size > 0), len(run))
         for distances in ([apart], [apart, _rms(run - coarse)])
@@ -220,7 +226,7 @@ def error_of(motions: Sequence[Tensor], substeps: Sequence[int], frame_dt: float
     if chaos < len(run):
         said += f" From {chaos * frame_dt:.2g} s on two runs that differ in their substeps alone are apart, which is "
         said += "chaos: frames are statistics then, not predictions."
-    rows = {"error_m": error, "grid_m": grid, "substep_m": substep, "motion_m": _rms(run)}
+    rows = {"error_m": error, "grid_m": grid, "substep_m": substep, "model_m": model, "motion_m": motion}
     found: dict[str, Any] = {name: row.tolist() for name, row in rows.items()}
     found |= {"trusted_s": trusted, "chaos_s": None if chaos == len(run) else chaos * frame_dt}
     return found | {"size_m": size, "sentence": said}

@@ -165,10 +165,9 @@ def test_the_kernel_of_the_cells_is_their_definition(neighbours, monkeypatch):
     assert len(asked) == 5
 
 
-def test_same_input_same_areas_and_order_does_not_matter():
+def test_order_and_sign_do_not_matter():
     points = _plane("random", 50)
     areas = _areas(points)
-    assert torch.equal(areas, _areas(points))
     order = torch.randperm(2500)
     assert_close(_areas(points[order]), areas[order])
     alike(_areas(points, -UP).sum(), areas.sum(), 2e-3)

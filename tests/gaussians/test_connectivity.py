@@ -93,6 +93,14 @@ def test_what_stays_attached_lies_near_the_planes_of_both():
     assert (above > 1.3).double().mean() < 0.1
 
 
+def test_pieces_are_joined_again_where_most_pairs_were_cut():
+    k = torch.arange(5)
+    chains = torch.cat([torch.stack([5 * piece + k[:-1], 5 * piece + k[1:]], 1) for piece in range(3)])
+    most = torch.cat([torch.stack([k, k + 5], 1), torch.stack([k[:4] + 5, k[:4] + 10], 1)])
+    cut = torch.cat([torch.tensor([[0, 14]]), most])
+    assert sorted(connectivity._put_back(15, chains, cut).tolist()) == sorted(most.tolist())
+
+
 def test_what_hangs_together_is_never_taken_off():
     upright = sheet(1) @ rotation(math.pi / 2).T
     points = torch.cat([sheet(0), upright + double([1.0, 0.0, 2.1])])

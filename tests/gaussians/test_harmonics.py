@@ -7,14 +7,9 @@ from torch.testing import assert_close
 
 from gaussian_swaying.gaussians import harmonics
 from gaussian_swaying.gaussians.harmonics import evaluate_sh, rotate_sh, sh_basis, sh_to_color
+from gaussian_swaying.geometry.rotations import quat_to_rotation
 
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
-
-
-def _rotations(device, dtype, count):
-    q, r = torch.linalg.qr(randn(count, 3, 3))
-    q = q * r.diagonal(dim1=-2, dim2=-1).sign()[:, None]
-    return (q * torch.linalg.det(q)[:, None, None]).to(device, dtype)
 
 
 def _legendre(degree, order, z):
@@ -40,12 +35,6 @@ def _reference_basis(directions, degree):
             trig = torch.sin(m * azimuth) if order < 0 else torch.cos(m * azimuth)
             columns.append(norm * (math.sqrt(2) if m else 1) * _legendre(band, m, z) * trig)
     return torch.stack(columns, dim=-1)
-
-
-def test_signs_of_the_first_band():
-    """The convention of 3DGS files: -y, z, -x."""
-    basis = sh_basis(torch.eye(3), 1)[:, 1:]
-    assert_close(basis / 0.4886025, torch.tensor([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]]))
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -97,7 +86,10 @@ def test_what_an_inference_kept_serves_gradients(degree, device, monkeypatch):
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_rotated_coefficients_equal_turned_directions(device, dtype, degree):
-    directions, rotation = unit(50, 3, device=device, dtype=dtype), _rotations(device, dtype, 6)[:, None]
+    directions, rotation = (
+        unit(50, 3, device=device, dtype=dtype),
+        quat_to_rotation(unit(6, 1, 4, device=device, dtype=dtype)),
+    )
     sh = torch.randn(50, (degree + 1) ** 2, 3, device=device, dtype=dtype)
     turned = (rotation.mT @ directions[..., None]).squeeze(-1)
     actual = evaluate_sh(rotate_sh(sh, rotation), directions.expand(6, 50, 3))
@@ -106,7 +98,7 @@ def test_rotated_coefficients_equal_turned_directions(device, dtype, degree):
 
 def test_gradients(device):
     sh = randn(2, 16, 3, device=device, requires_grad=True)
-    rotation = _rotations(device, torch.float64, 2).requires_grad_()
+    rotation = quat_to_rotation(unit(2, 4, device=device)).requires_grad_()
     assert torch.autograd.gradcheck(rotate_sh, (sh, rotation), fast_mode=True)
     assert torch.autograd.gradcheck(evaluate_sh, (sh, unit(2, 3, device=device)), fast_mode=True)
 

@@ -8,7 +8,6 @@ from shared import EYE, alike, unit
 from torch.testing import assert_close
 
 from gaussian_swaying.gaussians.area import coverage_area
-from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.gaussians.openness import LEAST, openness
 from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.scenes.ficus import ficus
@@ -95,12 +94,6 @@ def test_free_sheets_keep_their_area(opacity):
     cloud.opacities.fill_(math.log(opacity / (1 - opacity)))
     weight, _ = weights(bodies.of_cloud(cloud))
     assert weight.min() > 0.99
-
-
-def test_areas_of_the_model_are_weighed():
-    cloud = FlagScene(spacing=0.1).generate()
-    model = GaussianSurfaceModel.from_cloud(cloud)
-    assert_close(model.areas("open"), model.areas("coverage"))
 
 
 @pytest.mark.slow(gate=["50-0.96"])

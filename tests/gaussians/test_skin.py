@@ -8,10 +8,9 @@ from shared import value_error
 from small_scenes import varied_cloud
 from torch.testing import assert_close
 
-from gaussian_swaying import GaussianSurfaceModel, Simulation, SplatSkin
+from gaussian_swaying import GaussianSurfaceModel, SplatSkin
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.geometry.rotations import quat_to_rotation
-from gaussian_swaying.scenes.procedural import FlagScene
 
 TURN = quat_to_rotation(torch.tensor([0.3, -0.5, 0.7, 0.2], dtype=torch.float64))
 SHIFT = torch.tensor([0.4, -0.2, 1.0], dtype=torch.float64)
@@ -184,21 +183,6 @@ def test_a_model_in_training_keeps_its_gradient():
     (moved.means.sum() + moved.covariances.sum()).backward()
     assert_close(model.means.grad, torch.ones(20, 3))
     assert (model.scales.grad[:, 0] > 0).all()
-
-
-def test_the_motion_of_a_run_from_its_points(parser):
-    """A flag of quadratic B-splines, whose Gaussians follow its material points instead of its nodes."""
-    simulation = Simulation(FlagScene(spacing=0.04), hold="auto", wind=[4, 0, 0], device="cpu")
-    scene, state = simulation.scene, simulation.start()
-    skin = SplatSkin(scene.model, scene.frame.point_to_scene(scene.points.position.double()).float())
-    for _ in range(10):
-        state, _ = simulation.advance(state)
-    wanted = scene.deformed(state)
-    found = skin(scene.frame.point_to_scene(state.position.double()).float())
-    motion = (wanted.means - scene.model.means).square().sum(-1).mean().sqrt()
-    assert motion > 0.01
-    assert (found.means - wanted.means).square().sum(-1).mean().sqrt() < 1e-3 * motion
-    assert (found.normals * wanted.normals).sum(-1).min() > math.cos(math.radians(3))
 
 
 def test_bad_points_are_refused():

@@ -346,42 +346,6 @@ def test_a_sum_of_truths_counts(block):
     assert int(out) == (x[:block] > 0).sum()
 
 
-def test_sums_over_the_axis_of_one_change_nothing(block):
-    x = torch.randn(8)[:block].contiguous()
-    out = torch.zeros(1 + 3 * block)
-    launch(_axes_without_items, (1,))(x, out, BLOCK=block)
-    assert_close(out[0], x.sum())
-    _same(out[1:].reshape(3, block), torch.stack([x, torch.arange(block).float(), x]))
-
-
-@triton.jit
-def _axes_without_items(x_in, out, BLOCK: tl.constexpr):
-    lane = tl.arange(0, BLOCK)
-    x = tl.load(x_in + lane)[None, :]
-    tl.store(out + tl.arange(0, 1), tl.sum(x, 1))
-    tl.store(out + 1 + lane, tl.sum(x, 0))
-    tl.store(out + 1 + BLOCK + lane, tl.sum(lane[:, None], 1).to(tl.float32))
-    tl.store(out + 1 + 2 * BLOCK + lane[None, :], tl.cumsum(x, 0))
-
-
-@triton.jit
-def _made(out, whole, n, BLOCK: tl.constexpr):
-    lane = tl.arange(0, BLOCK)
-    tl.store(out + lane, tl.zeros([BLOCK], tl.float32))
-    tl.store(out + BLOCK + lane, tl.full([BLOCK], 2.5, tl.float32))
-    tl.store(out + 2 * BLOCK + lane, tl.zeros_like(tl.load(out + lane)))
-    tl.store(out + 3 * BLOCK + lane, 4.5)  # one number for all
-    tl.store(whole + lane, tl.arange(3, 3 + BLOCK))
-    tl.store(whole + BLOCK + lane, tl.full([BLOCK], n, tl.int64))
-
-
-def test_blocks_of_one_number(block):
-    out, whole = torch.full((4 * block,), 77.0), torch.zeros(2 * block, dtype=torch.int64)
-    launch(_made, (1,))(out, whole, 5, BLOCK=block)
-    _same(out, torch.tensor([0.0, 2.5, 0.0, 4.5]).repeat_interleave(block))
-    _same(whole, torch.cat([torch.arange(3, 3 + block), torch.full((block,), 5)]))
-
-
 # ---- memory
 
 

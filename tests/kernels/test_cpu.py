@@ -368,26 +368,3 @@ def test_numbers_and_tensors_of_all_types_are_passed():
         assert float(x) == 16
     with pytest.raises(KeyError, match="uint8"):  # its bytes would be read with a sign
         launch(_advance, (1,))(torch.zeros(1, dtype=torch.uint8), 3)
-
-
-@triton.jit
-def _precise(x, out, tenth):
-    found = tl.zeros([1], tl.float32) + tenth + 0.2
-    tl.store(out + tl.arange(0, 1), tl.load(x).to(tl.float32) / 3 + found)
-
-
-def test_double_precision():
-    x, out = torch.tensor([1]), torch.zeros(1).double()
-    launch(_precise, (1,))(x, out, 0.1)
-    assert abs(float(out) - (1 / 3 + 0.3)) < 1e-15
-    launch(_precise, (1,))(x.float(), out, 0.1)
-    assert 1e-15 < abs(float(out) - (1 / 3 + 0.3)) < 1e-7
-    single = torch.zeros(1)
-    launch(_precise, (1,))(x.double(), single, 0.1)
-    assert abs(float(single) - (1 / 3 + 0.3)) < 1e-7
-
-
-def test_options_of_a_gpu_are_ignored():
-    x = torch.ones(1)
-    launch(_advance, (1,))(x, 2.0, num_warps=4, num_stages=2, maxnreg=128, launch_cooperative_grid=True)
-    assert float(x) == 3.0

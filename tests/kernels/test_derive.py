@@ -15,7 +15,6 @@ from gaussian_swaying.kernels.derive import (
     vjp,
 )
 from gaussian_swaying.kernels.language import tl, triton
-from gaussian_swaying.kernels.launch import lanes, launch
 
 LEAST = tl.constexpr(0.05)
 
@@ -87,28 +86,6 @@ def test_the_adjoint_is_the_gradient():
     by_a, by_s = on_tensors(adjoint)(tuple(x.detach()[:3]), x.detach()[3], tuple(bar))
     torch.testing.assert_close(torch.stack([*by_a, by_s]), expected[:4])
     assert text_of(adjoint) == text_of(vjp(formula, {"a": 3, "s": 0}, ("a", "s"), {"p": (2.0,), "SQUARED": True}))
-
-
-@triton.jit
-def kernel(x, out, count, ADJOINT: tl.constexpr, BLOCK: tl.constexpr):
-    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    mask = index < count
-    a = (tl.load(x + index, mask), tl.load(x + count + index, mask), tl.load(x + 2 * count + index, mask))
-    s = tl.load(x + 3 * count + index, mask)
-    by_a, by_s = ADJOINT(a, s, (s, s, s))
-    for k in tl.static_range(3):
-        tl.store(out + k * count + index, by_a[k], mask)
-    tl.store(out + 3 * count + index, by_s, mask)
-
-
-@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
-def test_a_derived_function_runs_in_a_kernel(device):
-    x = _inputs().detach()[:4].float().contiguous()
-    adjoint = vjp(formula, {"a": 3, "s": 0}, ("a", "s"), {"p": (2.0,), "SQUARED": True})
-    by_a, by_s = on_tensors(adjoint)(tuple(x[:3]), x[3], (x[3],) * 3)
-    found, block = torch.zeros_like(x, device=device), lanes(torch.device(device), 64)
-    launch(kernel, (-(-50 // block),))(x.to(device), found, 50, ADJOINT=adjoint, BLOCK=block)
-    torch.testing.assert_close(found.cpu(), torch.stack([*by_a, by_s]), rtol=1e-5, atol=1e-5)
 
 
 def test_a_tangent_is_the_transpose():

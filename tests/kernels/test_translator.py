@@ -71,26 +71,6 @@ def test_a_kernel_may_end_under_a_condition(keep):
 
 
 @triton.jit
-def _lanes_in_a_branch(x_in, out, n, BLOCK: tl.constexpr):
-    lane = tl.arange(0, BLOCK)
-    x = tl.zeros([BLOCK], tl.float32)
-    if n > 2:
-        x = tl.load(x_in + lane)
-        tl.store(out + BLOCK, 1.0)
-    else:
-        x += n
-    tl.store(out + lane, x)
-
-
-@pytest.mark.parametrize("n", [1, 3])
-def test_blocks_in_a_branch(n):
-    x, out = torch.randn(8), torch.zeros(9)
-    launch(_lanes_in_a_branch, (1,))(x, out, n, BLOCK=8)
-    assert torch.equal(out[:8], x if n > 2 else torch.ones(8))
-    assert float(out[8]) == float(n > 2)
-
-
-@triton.jit
 def _chosen(x, which: tl.constexpr):
     if which == "twice":
         return 2 * x

@@ -1,17 +1,12 @@
-"""The decompositions and materials of the kernels, one function at a time, against float64.
-
-A test of many matrices at once (also singular, inverted, tiny, with repeated stretches) costs almost nothing here.
-"""
+"""The materials of the kernels, one function at a time, against float64."""
 
 import math
 
 import pytest
 import torch
 from catalogue import ELASTIC, PLASTIC
-from torch.testing import assert_close
 
 from gaussian_swaying.geometry import linalg
-from gaussian_swaying.geometry.linalg_triton import polar_rotation, svd3
 from gaussian_swaying.kernels.language import tl, triton
 from gaussian_swaying.kernels.launch import lanes, launch
 from gaussian_swaying.mpm.dispatch import BodyLaws, in_common
@@ -34,21 +29,6 @@ def _matrix(pointer, index, mask):
 
 
 @triton.jit
-def _decompose(F_in, rotation, left, stretch, axes, count, BLOCK: tl.constexpr):
-    place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    mask = place < count
-    F = _matrix(F_in, place * 9, mask)
-    R = polar_rotation(F)
-    u, a, v = svd3(F)
-    for k in tl.static_range(9):
-        tl.store(rotation + place * 9 + k, R[k], mask)
-        tl.store(left + place * 9 + k, u[k], mask)
-        tl.store(axes + place * 9 + k, v[k], mask)
-    for k in tl.static_range(3):
-        tl.store(stretch + place * 3 + k, a[k], mask)
-
-
-@triton.jit
 def _scalars(F_in, wave, energy, mu, lam, count, WAVE: tl.constexpr, ENERGY: tl.constexpr, BLOCK: tl.constexpr):
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mask = place < count
@@ -66,70 +46,9 @@ def _turned(stretch, generator, device):
     return (turns[0] @ stretch.diag_embed() @ turns[1].mT).float().to(device)
 
 
-def _matrices(device, unique=False):
-    generator = torch.Generator().manual_seed(0)
-    special = [
-        [1.0, 1.0, 1.0], [2.0, 2.0, 1.0], [2.0, 1.0, 1.0], [1.0, 1.0 - 1e-6, 1.0 - 2e-6], [1.5, 0.7, 1e-3],
-        [1.5, 0.7, 1e-6], [3.0, 1e-2, 5e-3], [1.2, 1.0, -0.3], [1.2, 1.1, -0.02], [20.0, 1.0, 0.4],
-        [1.0001, 1.0, 0.9999], [0.051, 0.05, 0.049], [3.0, 0.9, -0.5], [1.5, 0.7, 0.0],
-    ]  # fmt: skip
-    if not unique:
-        special += [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1e-8, 1e-9, 1e-9], [1e4, 1e3, 1.0], [1.0, 1.0, -1.0]]
-    F = _turned(torch.tensor(special, dtype=torch.float64)[torch.arange(900) % len(special)], generator, device)
-    random = torch.eye(3, dtype=torch.float64) + 0.4 * torch.randn(900, 3, 3, dtype=torch.float64, generator=generator)
-    if unique:
-        values = torch.linalg.svdvals(random)
-        values[:, 2] *= torch.linalg.det(random).sign()
-        random = random[values[:, 1] + values[:, 2] > 0.05]
-    return torch.cat([F, random.to(F)])
-
-
 def _launch(kernel, count, *arguments, **options):
     block = lanes(arguments[0].device, 128)
     launch(kernel, (-(-count // block),))(*arguments, count, **options, BLOCK=block)
-
-
-def _decomposed(F):
-    rotation, left, axes = (torch.empty_like(F) for _ in range(3))
-    stretch = F.new_empty(len(F), 3)
-    _launch(_decompose, len(F), F, rotation, left, stretch, axes)
-    return rotation, left, stretch, axes
-
-
-def test_decomposition(kernel_device):
-    """U and V are rotations for any F, and the product is F, to some units in the last place of its size."""
-    F = _matrices(kernel_device)
-    _, left, stretch, axes = _decomposed(F)
-    eye = torch.eye(3, device=kernel_device).expand_as(F)
-    for turn in (left, axes):
-        assert_close(turn @ turn.mT, eye, rtol=0, atol=3e-6)
-        assert_close(torch.linalg.det(turn), torch.ones_like(stretch[:, 0]), rtol=0, atol=3e-6)
-    size = torch.linalg.matrix_norm(F)
-    product = left @ stretch.diag_embed() @ axes.mT
-    assert bool((torch.linalg.matrix_norm(product - F) <= 3e-6 * size + 1e-14).all())
-    exact = linalg.svd3(F.double())[1]
-    assert bool(((stretch - exact).abs().amax(-1) <= 2e-6 * size + 1e-14).all())
-    assert bool(
-        (stretch[:, 0] >= stretch[:, 1] - 1e-6 * size).all()
-        & (stretch[:, 1] >= stretch[:, 2].abs() - 1e-6 * size).all()
-    )
-
-
-def test_nearest_rotation(kernel_device):
-    """Five iterations are enough for stretches that differ by a factor of fifty; beyond that, as in torch."""
-    F = _matrices(kernel_device, unique=True)
-    rotation = _decomposed(F)[0]
-    exact = linalg.polar_rotation(F.double()).float()
-    values = linalg.svd3(F.double())[1]
-    easy = values[:, 2].abs() * 50 > values[:, 0]
-    assert int(easy.sum()) > 900
-    assert_close(rotation[easy], exact[easy], rtol=0, atol=1e-5)
-    assert bool(torch.isfinite(_decomposed(_matrices(kernel_device))[0]).all())
-
-
-def _body(law, device):
-    body = BodyLaws([law])
-    return body, torch.tensor(body.table, device=device)
 
 
 ENERGIES = list(ELASTIC.values())

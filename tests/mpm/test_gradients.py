@@ -9,10 +9,7 @@ from gaussian_swaying.mpm.laws.elastic import FixedCorotated, NeoHookean
 from gaussian_swaying.mpm.transfer import bspline_stencil, scatter
 
 STEPS, DT, DX, COUNT = 5, 8e-3, 0.15, 15
-SETTINGS = {
-    "total": {"formulation": "total"},
-    "updated": {"formulation": "updated"},
-}
+FORMULATIONS = "total", "updated"
 LAWS = {"fixed_corotated": FixedCorotated, "neo_hookean": NeoHookean}
 
 
@@ -104,21 +101,21 @@ def _check(name, law, **settings):
 
 @pytest.mark.slow(gate=[f"{name}-{few}" for few in ("total-neo_hookean", "updated-fixed_corotated") for name in INPUTS])
 @pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("setting", SETTINGS)
+@pytest.mark.parametrize("setting", FORMULATIONS)
 @pytest.mark.parametrize("name", INPUTS)
 def test_gradient_of_five_substeps(name, setting, law):
-    _check(name, LAWS[law](), **SETTINGS[setting])
+    _check(name, LAWS[law](), formulation=setting)
 
 
-@pytest.mark.parametrize("setting", SETTINGS)
+@pytest.mark.parametrize("setting", FORMULATIONS)
 @pytest.mark.parametrize("name", ["position", "youngs_modulus", "poisson_ratio"])
 def test_gradient_with_damping_and_two_laws(name, setting):
-    _check(name, [FixedCorotated(), NeoHookean()], damping=2.0, stiffness_damping=2e-3, **SETTINGS[setting])
+    _check(name, [FixedCorotated(), NeoHookean()], damping=2.0, stiffness_damping=2e-3, formulation=setting)
 
 
 @pytest.mark.parametrize("case", ["at rest", "light node"])
 @pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("setting", SETTINGS)
+@pytest.mark.parametrize("setting", FORMULATIONS)
 def test_gradients_are_finite(setting, law, case):
     """F = I exactly, no motion, no wind, no weight; and a node whose mass is so small that the square of its inverse
     overflows in float32.
@@ -131,7 +128,7 @@ def test_gradients_are_finite(setting, law, case):
         values["position"][0] = torch.tensor([0.075] * 3) - 1e-3 * DX  # its farthest node has half the cube of 1e-6
     values = {name: value.clone().requires_grad_() for name, value in values.items()}
     gravity = (0.0, 0.0, 0.0) if still else (0.0, 0.0, -9.8)
-    solver, state, force = _start(values, LAWS[law](), gravity=gravity, **SETTINGS[setting])
+    solver, state, force = _start(values, LAWS[law](), gravity=gravity, formulation=setting)
     if not still:
         stencil = bspline_stencil(values["position"].detach(), state.grid)
         mass = scatter(stencil, solver.points.mass.detach()[:, None, None])[:, 0]

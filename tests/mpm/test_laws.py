@@ -9,6 +9,7 @@ from shared import EYE, alike, double, near, peak, rand, randn, unit, value_erro
 from torch.testing import assert_close
 
 from gaussian_swaying.geometry.linalg import spectrum
+from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.kernels.derive import on_tensors
 from gaussian_swaying.mpm.laws import LAWS as KINDS
 from gaussian_swaying.mpm.laws.law import LOG_LIMIT, lame_parameters, log
@@ -42,8 +43,7 @@ def _wide(count=60):
 
 
 def _rotations(*shape):
-    Q = torch.linalg.qr(randn(*shape, 3, 3))[0]
-    return Q * torch.linalg.det(Q)[..., None, None]
+    return quat_to_rotation(randn(*shape, 4))
 
 
 def _turned(stretches):

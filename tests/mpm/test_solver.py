@@ -78,6 +78,18 @@ def test_grid_follows_the_object_without_changing_the_motion():
     assert not following.lost.any()
 
 
+def test_a_grid_holds_what_lies_within_it():
+    grid = GridSpec(0.1, (-2, 0, 3), (5, 4, 6))
+    assert grid.holds(grid)
+    assert grid.holds(GridSpec(0.1, (-1, 1, 3), (4, 3, 6)))
+    for other in (
+        GridSpec(0.1, (-3, 0, 3), (5, 4, 6)),
+        GridSpec(0.1, (-2, 0, 3), (5, 5, 6)),
+        GridSpec(0.2, (-2, 0, 3), (5, 4, 6)),
+    ):
+        assert not grid.holds(other)
+
+
 def test_room_lies_where_a_grid_was_outgrown():
     before = GridSpec(0.1, (0, 0, 0), (40, 40, 40))
     needed = GridSpec(0.1, (2, -1, 0), (80, 30, 40))

@@ -22,6 +22,8 @@ from gaussian_swaying.mpm.colliders import Obstacle, VelocityBox, Wall
 from gaussian_swaying.mpm.contact import Surface
 from gaussian_swaying.mpm.embedded import EmbeddedInGrid, on_material
 from gaussian_swaying.mpm.pins import RigidRegion
+from gaussian_swaying.mpm.state import GridSpec
+from gaussian_swaying.mpm.virtual_nodes import virtual_nodes
 from gaussian_swaying.wind.effects import Profile
 
 EDGE = up_to(x=1.0)
@@ -298,6 +300,17 @@ def test_contact_and_obstacles_in_kernels():
     low, high = (end.position[number == k, 2] for k in (0, 1))
     assert (high - low).min() > 0.1  # across tilted sheets; one that has passed the other has less than 0
     assert ((end.position - torch.tensor([2.0, 2.0, 2.3]).double()).norm(dim=-1) > 0.7).all()
+
+
+def test_copies_are_numbered_after_the_lattice():
+    grid = GridSpec(1.0, (0, 0, 0), (4, 3, 3))
+    first = torch.tensor([0, 0, 9])
+    found = virtual_nodes(first, grid, torch.tensor([[0, 2]]))
+    assert found.original.shape == (1, 27)
+    assert torch.equal(found.node[:, 1], 36 + torch.arange(27))  # the second point is alone
+    assert torch.equal(found.original[0], torch.arange(27))
+    assert torch.equal(found.node[:18, 2], found.node[9:, 0])  # the others share what both reach
+    assert found.node[:, [0, 2]].max() < 36
 
 
 def test_wrong_numbers_are_refused():

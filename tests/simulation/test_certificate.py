@@ -6,7 +6,7 @@ from shared import peak, up_to, value_error
 
 from gaussian_swaying import AeroForce, Copy, Material, MPMSolver, PinnedRegion, Recorder, Simulation
 from gaussian_swaying.scenes import FlagScene
-from gaussian_swaying.simulation.certificate import APART, COARSER, SAFETY, error_of
+from gaussian_swaying.simulation.certificate import APART, COARSER, MODEL, SAFETY, error_of
 from gaussian_swaying.simulation.measure import SimulationDiverged
 
 DT = 0.1
@@ -31,6 +31,9 @@ def test_the_error_of_a_method_of_known_order():
     grid = by_grid * (COARSER**2 - 1) + by_step / 2000
     assert found["grid_m"] == pytest.approx((SAFETY * grid / (COARSER**2 - 1) * size).tolist())
     assert found["substep_m"] == pytest.approx((SAFETY * by_step / 2000 * size).tolist())
+    assert found["model_m"] == pytest.approx([MODEL * moved for moved in found["motion_m"]])
+    parts = torch.tensor([found["grid_m"], found["substep_m"], found["model_m"]], dtype=torch.float64)
+    assert found["error_m"] == pytest.approx(parts.norm(dim=0).tolist())
     true = (solved(1.0, 2000) - swing).square().sum(-1).mean(-1).sqrt()
     assert (torch.tensor(found["error_m"], dtype=torch.float64) >= true).all()
     assert found["trusted_s"] == pytest.approx(1.9)

@@ -156,19 +156,6 @@ def test_nothing_but_the_stress_changes_at_once(formulation, make_simulation):
     assert float(edited.scene.points.youngs_modulus.max()) == 3e3
 
 
-def test_an_edit_by_hand_is_that_of_the_list(make_simulation):
-    edit = Edit(_free_half(), time=0.04, density=90.0)
-    expected = _frames(_with(make_simulation(), edit), 3)[-1]
-    simulation = make_simulation()
-    state, _ = simulation.advance(simulation.start())
-    state = simulation.edit(state, edit)
-    for _ in range(2):
-        state, _ = simulation.advance(state)
-    assert torch.equal(state.position, expected.position)
-    mass = simulation.solver.points.mass
-    assert float(mass.max() / mass.min()) > 2.0
-
-
 def test_sand_becomes_foam(make_cloud, make_simulation):
     """The paper's edit: the internal variable of sand is gone, deformations and positions are not."""
     block = make_cloud(60, degree=0)

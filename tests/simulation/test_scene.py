@@ -3,7 +3,7 @@ import math
 
 import pytest
 import torch
-from shared import EYE, double, near, rand, seeded, silent, up_to, user_warning, value_error
+from shared import EYE, double, near, seeded, silent, up_to, user_warning, value_error
 from small_scenes import together
 
 from gaussian_swaying.gaussians.filling import InteriorFilling
@@ -25,12 +25,6 @@ UPS = [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [0.3, -0.7, 0.2]]
 
 def _rest_state(scene):
     return MPMSolver(0.25).init_state(scene.points)
-
-
-def _rotation(dtype=torch.float64):
-    q, r = torch.linalg.qr(rand(3, 3, generator=seeded(5)))
-    q = q * torch.sign(torch.diagonal(r))
-    return (q * torch.sign(torch.linalg.det(q))).to(dtype)
 
 
 def _faint_cloud(make_cloud):
@@ -133,7 +127,7 @@ def test_rotations_are_left_out_where_nobody_asks(up, settings, make_cloud, make
 def test_a_rigid_motion_moves_everything_rigidly(up, make_cloud, make_scene):
     scene = make_scene(_faint_cloud(make_cloud), up=up, longest_side=0.5, dtype=torch.float64)
     state, frame = _rest_state(scene), scene.frame
-    R, shift = _rotation(), double([0.2, -0.1, 0.4])
+    R, shift = quat_to_rotation(double([0.3, -0.5, 0.7, 0.2])), double([0.2, -0.1, 0.4])
     F = R.expand(20, 3, 3)
     deformed = scene.deformed(state.replace(position=state.position @ R.T + shift, F_total=F, F_elastic=F))
     turn = (frame.rotation.T @ R @ frame.rotation).float()

@@ -11,6 +11,7 @@ from shared import ZERO, advanced, double, in_both, longest, normalized, peak, s
 from gaussian_swaying.captures.capture_camera import CaptureCamera
 from gaussian_swaying.gaussians.model import GaussianSurfaceModel
 from gaussian_swaying.gaussians.ply import read_ply
+from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.rendering.cameras.camera import orbit_camera
 from gaussian_swaying.rendering.cameras.camera_path import LookAtCamera, OrbitCamera
@@ -232,14 +233,6 @@ def test_a_camera_inside_the_object_is_an_error(make_cloud, make_simulation):
 # ---- colours
 
 
-def _turn():
-    """A rotation of the simulation frame by 70 degrees about an oblique axis."""
-    axis = torch.nn.functional.normalize(double([0.4, -0.3, 0.8]), dim=0)
-    x, y, z = axis.tolist()
-    skew = double([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return torch.matrix_exp(math.radians(70.0) * skew)
-
-
 def _colours(simulation, state, frame=0):
     painter = simulation.painter
     return painter.colors(painter.deformed(state), painter.camera_at(frame))
@@ -247,7 +240,7 @@ def _colours(simulation, state, frame=0):
 
 def test_colours_turn_with_the_object(make_cloud, make_simulation):
     simulation = make_simulation(make_cloud(), pinned=False, scene={"up": [0.0, -1.0, 0.0], "longest_side": 0.5})
-    frame, state, R = simulation.scene.frame, simulation.start(), _turn()
+    frame, state, R = simulation.scene.frame, simulation.start(), quat_to_rotation(double([0.8, 0.3, -0.2, 0.5]))
     turned = state.replace(position=(state.position.double() @ R.T).float(), F_total=R.float().expand_as(state.F_total))
     eye = double([3.0, 1.0, -2.0])
     turned_eye = frame.point_to_scene(frame.point_to_sim(eye) @ R.T)

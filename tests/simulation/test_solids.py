@@ -3,7 +3,7 @@ import math
 
 import pytest
 import torch
-from shared import in_both, longest, near, up_to, value_error
+from shared import in_both, longest, near, up_to
 
 from gaussian_swaying.gaussians.filling import InteriorFilling
 from gaussian_swaying.geometry.regions import Not, Sphere
@@ -11,7 +11,7 @@ from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.recording.recorder import Recorder
 from gaussian_swaying.rendering.cameras.camera_path import OrbitCamera
-from gaussian_swaying.scenes import FlagScene, GivenScene
+from gaussian_swaying.scenes import GivenScene
 from gaussian_swaying.scenes.solid import SolidScene
 from gaussian_swaying.simulation.body import Material, MaterialRegion, Scene, SimulatedScene, cell_volume
 from gaussian_swaying.simulation.simulation import Simulation
@@ -153,11 +153,6 @@ def test_regions_reach_the_filling():
 def test_physgaussians_volumes_count_the_filling():
     scene = _scene(material=Material(volume="cell"))
     torch.testing.assert_close(scene.points.volume, cell_volume(scene.points.position, DX))
-
-
-def test_an_open_surface_is_refused():
-    with value_error("remove `filling`"):
-        _scene(generator=FlagScene(spacing=0.05))
 
 
 def test_a_run_of_a_filled_solid(tmp_path):

@@ -5,7 +5,7 @@ import torch
 from shared import alike, double, longest, near, peak, up_to
 from torch.testing import assert_close
 
-from gaussian_swaying import AeroForce, Box, Material, MPMSolver, Scene, Simulation, WindField
+from gaussian_swaying import Box, Material, MPMSolver, Scene, Simulation, WindField
 from gaussian_swaying.air.flow import SOUND
 from gaussian_swaying.air.immersed import look
 from gaussian_swaying.kernels.graphs import Replayed
@@ -247,4 +247,3 @@ def test_what_cannot_be_right_is_refused(changes, message):
 
 def test_a_wind_that_is_not_there_costs_nothing():
     assert not any(type(force).__name__ == "WindForce" for force in _simulation().stepper.forces)
-    assert AeroForce().air_density > 0

@@ -6,6 +6,7 @@ from shared import double, normalized, peak, randn, unit, value_error
 from torch.testing import assert_close
 
 from gaussian_swaying import AeroForce, aero_force
+from gaussian_swaying.geometry.rotations import quat_to_rotation
 from gaussian_swaying.wind.force import LAWS, added_mass_per_area
 
 RHO = 1.225
@@ -102,8 +103,7 @@ def test_a_rotation_turns_the_force_and_the_sign_of_the_normal_does_not_matter(l
     aero = AeroForce(law=law)
     force = aero(wind, velocity, normal, area)
     assert_close(aero(wind, velocity, -normal, area), force)
-    Q = torch.linalg.qr(randn(3, 3))[0]
-    Q = Q * torch.linalg.det(Q)
+    Q = quat_to_rotation(unit(4))
     assert_close(aero(Q @ wind, velocity @ Q.T, normal @ Q.T, area), force @ Q.T)
     drag = AeroForce(C_F=0.0, C_L=0.0, law=law)(wind, velocity, normal, area)
     assert ((drag * (wind - velocity)).sum(-1) >= 0).all()

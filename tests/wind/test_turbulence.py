@@ -20,7 +20,6 @@ from gaussian_swaying.wind.turbulence import (
 )
 from gaussian_swaying.wind.turbulence import (
     LOOKS,
-    VON_KARMAN,
     Turbulence,
     along_spectrum,
     energy_spectrum,
@@ -39,12 +38,6 @@ def looked_up(table, place, wraps=False):
     """Values of a table at places in cells (n, 3)."""
     sizes = tuple(map(float, table.shape[:3]))
     return torch.stack(on_tensors(look_up)(Memory(table), sizes, place.unbind(-1), (wraps,) * 3 + (3,)), dim=-1)
-
-
-def _bessel_k(order, x):
-    """Modified Bessel function of the second kind, by its integral."""
-    t = torch.linspace(0, 40, 20001, dtype=torch.float64)
-    return torch.trapezoid(torch.exp(-x[..., None] * torch.cosh(t)) * torch.cosh(order * t), t)
 
 
 def _waves(cells=CELLS, spacing=H):
@@ -116,18 +109,6 @@ def test_spectra_are_von_karmans(measured):
     band = slice(1, 9)
     assert float(k1[8]) == pytest.approx(K / 8)
     assert float((measured[1][band] / along_spectrum(k1[band], L)).mean()) == pytest.approx(1.0, abs=0.05)
-
-
-def test_correlation_and_integral_length_are_von_karmans(measured):
-    """At distances of a cell or more; at zero the closed form has the variance that the cells leave out as well."""
-    step = 2 * math.pi / (CELLS[0] * H)
-    correlation = (torch.fft.ifft(measured[1]).real * CELLS[0] * step)[: 4 * 6 + 1]
-    x = H * torch.arange(1, 25, dtype=torch.float64) / (VON_KARMAN * L)
-    closed = 2 ** (2 / 3) / math.gamma(1 / 3) * x ** (1 / 3) * _bessel_k(1 / 3, x)
-    near(correlation[1:], closed, 0.03)
-    correlation[0] = 1.0
-    length = float(torch.trapezoid(correlation, dx=H))
-    assert length == pytest.approx(L, rel=0.05)
 
 
 def test_coherence_is_that_of_the_waves_of_the_box(measured):

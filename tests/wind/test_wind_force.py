@@ -130,10 +130,10 @@ def test_shapes_are_checked():
 
 
 class Whirl(SpatialWind):
-    """Air that turns about the origin."""
+    """Air that turns about the origin, faster and faster."""
 
     def forward(self, time, position):
-        return torch.stack([-position[..., 1], position[..., 0], torch.zeros_like(position[..., 0])], dim=-1)
+        return time * torch.stack([-position[..., 1], position[..., 0], torch.zeros_like(position[..., 0])], dim=-1)
 
 
 def _blown(winds, turn, shift, delay):
@@ -159,9 +159,9 @@ def test_copies_feel_one_wind_turned_and_later():
 @pytest.mark.parametrize("wind", [Whirl(), WindField([4.0, 1.0, 0.0], effects=[Profile(height=2.0, exponent=0.14)])])
 def test_copies_feel_the_wind_at_their_places(wind):
     turn, shift = turned_by(30.0), double([2.0, -1.0, 0.5])
-    load, position = _blown([wind] * 2, turn, shift.tolist(), 0.0)
-    now, there = double(2.0), position[1] @ turn.T + shift
-    wanted = [wind.at(now, p) if isinstance(wind, WindField) else wind(now, p) for p in (position[0], there)]
+    load, position = _blown([wind] * 2, turn, shift.tolist(), 0.7)
+    now, there, air = double(2.0), position[1] @ turn.T + shift, wind.at if isinstance(wind, WindField) else wind
+    wanted = [air(now, position[0]), air(now - 0.7, there)]
     found = load.air(now, position)
     assert_close(found[0], wanted[0])
     assert_close(found[1] @ turn.T, wanted[1])

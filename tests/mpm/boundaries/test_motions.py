@@ -5,8 +5,7 @@ import math
 
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
-from shared import ZERO, alike, beyond, double, in_both, near, peak, solid, up_to
+from shared import ZERO, alike, beyond, double, in_both, near, peak, solid, turned_by, up_to
 from torch.testing import assert_close
 
 from gaussian_swaying import Box, MaterialPoints, MPMSolver, PinnedRegion, Sphere
@@ -64,7 +63,7 @@ def test_handle_in_a_frame_that_scales_and_turns(formulation):
     steps = 60 - first
     own = scene[:, 0] < 8
     assert int(own.sum()) == 27
-    turn = torch.tensor(Rotation.from_rotvec([0.0, 0.0, 4.0 * dt * steps]).as_matrix())
+    turn = turned_by(math.degrees(4.0 * dt * steps))
     centre = frame.point_to_sim(double(pivot))
     expected = centre + velocity * dt * steps + (position[own] - centre) @ turn.T
     near(state.position[own], expected, 1e-12)

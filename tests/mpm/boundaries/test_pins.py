@@ -19,6 +19,7 @@ from shared import (
     randn,
     seeded,
     solid,
+    turned_by,
     up_to,
     user_warning,
     value_error,
@@ -258,9 +259,8 @@ def test_a_handle_moves_its_points_exactly(kind):
     states = _run(solver, points, steps, dt, every=500)
     rest = _own_places(solver)
     for state in states[1:]:
-        angle, time = rate * float(state.time), float(state.time)
-        c, s = math.cos(angle), math.sin(angle)
-        turn = double([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        time = float(state.time)
+        turn = turned_by(math.degrees(rate * time))
         centre = double(pivot)
         wanted = centre + time * double(velocity) + (rest - centre) @ turn.T
         rows = _read(rest, state, "node_displacement")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import curve_fit
-from shared import ZERO, beyond, double, in_both, longest, near, peak, solid, up_to, value_error
+from shared import ZERO, beyond, double, in_both, longest, near, peak, solid, turned_by, up_to, value_error
 from torch.testing import assert_close
 
 from gaussian_swaying import Box, MPMSolver, PinnedPoints, PinnedRegion
@@ -113,8 +113,7 @@ def test_a_handle_leads_the_whole_part(formulation):
     handle = PinnedRegion(beyond(x=0.3), "nodes", angular_velocity=[0, 0, 2.0], pivot=[0.4, 0, 0])
     points, solver = bar(RigidRegion(RIGHT), handle, formulation=formulation, gravity=ZERO)
     state = advance(solver, solver.init_state(points), 0.25)
-    s, c = math.sin(0.5), math.cos(0.5)
-    turn = double([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+    turn = turned_by(math.degrees(0.5))
     pivot = double([0.4, 0, 0])
     wanted = pivot + (points.position - pivot) @ turn.mT
     near(state.position[right(points)], wanted[right(points)], 1e-5)

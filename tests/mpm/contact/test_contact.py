@@ -47,15 +47,6 @@ def test_sheets_that_collide_do_not_pass_each_other(speed, friction):
         assert later.velocity[points.count - 100 :, 0].mean() > 0.7 * 0.3 * speed
 
 
-def test_without_contact_they_do_pass():
-    points, velocity, triangles = _two(2.0)
-    solver, state = scene(points, None, velocity=velocity, gravity=ZERO)
-    assert solver.bound.contact is None  # off costs nothing
-    crossed = [crossings(later.position, triangles) for later in march(solver, state, 0.09)]
-    assert state.position[-100:, 2].mean() > 0 > march(solver, state, 0.09)[-1].position[-100:, 2].mean()
-    assert crossed[0] == 0
-
-
 @pytest.mark.parametrize("seconds", [0.46, pytest.param(0.8, marks=pytest.mark.slow)])
 def test_a_strip_that_falls_folds_and_does_not_cross_itself(seconds):
     """Upright on the ground, with a slight bend, it buckles into layers of one sheet."""
