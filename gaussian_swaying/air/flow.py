@@ -326,6 +326,13 @@ class LatticeFlow(nn.Module):
         tensor([1., 0., 0.])
     """
 
+    kind: Tensor
+    held: Tensor
+    behind: Tensor
+    outward: Tensor
+    special: Tensor
+    gaps: Tensor
+
     def __init__(
         self,
         cells: Sequence[int],
@@ -372,12 +379,6 @@ class LatticeFlow(nn.Module):
             ("gaps", torch.zeros(0)),
         ):
             self.register_buffer(name, value, persistent=False)
-        self.kind: Tensor
-        self.held: Tensor
-        self.behind: Tensor
-        self.outward: Tensor
-        self.special: Tensor
-        self.gaps: Tensor
         if solid is not None:
             self.gaps = _gaps(kind, self.special.long(), solid)
 

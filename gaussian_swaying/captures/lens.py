@@ -51,7 +51,7 @@ def _derivatives(points: Tensor, coefficients: tuple[float, ...]) -> tuple[Tenso
     )
 
 
-def undistort(points: Tensor, coefficients: tuple[float, ...], iterations: int = 20) -> Tensor:
+def undistort(points: Tensor, coefficients: tuple[float, ...]) -> Tensor:
     """Inverse of :func:`distort` by Newton's method.
 
     Args:
@@ -62,7 +62,7 @@ def undistort(points: Tensor, coefficients: tuple[float, ...], iterations: int =
         Pinhole points, shape (..., 2).
     """
     solution = points.double()
-    for _ in range(iterations):
+    for _ in range(20):
         xx, xy, yy = _derivatives(solution, coefficients)
         error = distort(solution, coefficients) - points
         determinant = xx * yy - xy * xy

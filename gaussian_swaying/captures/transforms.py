@@ -84,13 +84,13 @@ def _merged(data: dict[str, object], frame: dict[str, object]) -> dict[str, obje
     return {name: value for name, value in data.items() if name not in hidden} | frame
 
 
-def check_rigid(what: str, pose: torch.Tensor, tolerance: float = 1e-3) -> None:
+def check_rigid(what: str, pose: torch.Tensor) -> None:
     """Raise ValueError unless a matrix (4, 4) is a rigid motion; ``what`` is the subject of the message."""
     rotation, row = pose[:3, :3], pose.new_tensor([0.0, 0.0, 0.0, 1.0])
     error = max(
         float((rotation @ rotation.T - torch.eye(3, dtype=pose.dtype)).abs().max()), float((pose[3] - row).abs().max())
     )
-    if not error <= tolerance:
+    if not error <= 1e-3:
         raise ValueError(
             f"{what} is not rigid (off by {error:.3g} from a rotation and a shift): apply the scale of the camera and "
             "export it again."

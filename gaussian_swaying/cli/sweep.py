@@ -72,7 +72,7 @@ def sweep(options: argparse.Namespace, arguments: Sequence[str]) -> int:
 
     if options.shards is not None:
         check_whole("shards", options.shards, 1)
-        check_extra("shards", "webdataset")
+        check_extra("shards")
     file = Path(with_shipped(["--config", options.sweep], "sweep")[1])
     parser = Simulation.parser()
     with guessing(parser):

@@ -129,6 +129,16 @@ class SplatSkin(Fixed, nn.Module):
         ValueError: If a tensor does not have the shape above, or a point is not finite.
     """
 
+    rest: Tensor
+    index: Tensor
+    weight: Tensor
+    slope: Tensor
+    arm: Tensor
+    axis: Tensor
+    dimensions: Tensor
+    _covariances: Tensor
+    _normals: Tensor
+
     def __init__(
         self,
         gaussians: GaussianSurfaceModel | GaussianCloud,
@@ -157,15 +167,6 @@ class SplatSkin(Fixed, nn.Module):
         self.register_buffer("dimensions", dimensions.to(device, torch.int8))
         self.register_buffer("_covariances", gaussians.covariance().detach())
         self.register_buffer("_normals", gaussians.normals().detach())
-        self.rest: Tensor
-        self.index: Tensor
-        self.weight: Tensor
-        self.slope: Tensor
-        self.arm: Tensor
-        self.axis: Tensor
-        self.dimensions: Tensor
-        self._covariances: Tensor
-        self._normals: Tensor
 
     def forward(self, points: Tensor, deformation_gradient: Tensor | None = None) -> DeformedGaussians:
         """The Gaussians where the points have moved.

@@ -32,7 +32,7 @@ class Evidence:
 
     def __init__(self, simulation: Simulation, video: Footage, tracks: Tracks, trust: Tensor | None = None) -> None:
         scene = simulation.scene
-        self.video, self.tracks, self.trust, self._frame = video, tracks, trust, scene.frame
+        self.simulation, self.video, self.tracks, self.trust = simulation, video, tracks, trust
         index = tracks.index.to(scene.moving.device)
         self._follow = scene.follow.some(index).to(scene.moving.device)
         self._means = scene.model.means.detach()[scene.moving[index]]
@@ -46,7 +46,7 @@ class Evidence:
     def shown(self, states: Sequence[State]) -> Tensor:
         """Places of the Gaussians [scene units], shape (B, T, 3)."""
         moves = torch.stack([self._follow.motion(state)[0] for state in states]).to(self._means)
-        return (self._means + self._frame.displacement_to_scene(moves)).cpu()
+        return (self._means + self.simulation.scene.frame.displacement_to_scene(moves)).cpu()
 
     def pixels(self, shown: Tensor, frame: int) -> Tensor:
         """Where a frame would have them [pixels], shape (B, T, 2)."""
@@ -60,7 +60,6 @@ class Evidence:
 
 
 def compare(
-    simulation: Simulation,
     evidence: Sequence[Evidence],
     values: Sequence[Values],
     times: Sequence[float],
@@ -68,10 +67,11 @@ def compare(
     starts: Sequence[float] = (),
     tick: Callable[[int], object] = int,
 ) -> list[Block]:
-    """Simulate variants, and compare each with the videos at times [s], at 0 only if these begin in motion.
+    """Simulate variants of the evidence's simulation, and compare each with the videos at times [s].
 
-    The variants have the same substeps unless one diverges. With ``starts``, of a wind that does not depend on time,
-    there is a block for each of them: what the residuals were if all had begun to move then, from one simulation.
+    At 0 they are compared only if the videos begin in motion. They have the same substeps unless one diverges. With
+    ``starts``, of a wind that does not depend on time, there is a block for each of them: what the residuals were if
+    all had begun to move then, from one simulation.
     """
     wanted: dict[float, tuple[float, list[tuple[int, float]]]] = {}  # what is compared with a state, by its time
     for number, start in enumerate(starts or [0.0]):
@@ -83,7 +83,7 @@ def compare(
 
     def compared(alike: bool) -> list[Block]:
         parts: list[list[tuple[Tensor, Tensor, Tensor]]] = [[] for _ in starts or [0.0]]
-        runs = states_of(simulation, own, [moment for moment, _ in moments], alike)
+        runs = states_of(evidence[0].simulation, own, [moment for moment, _ in moments], alike)
         for number, ((_, what), states) in enumerate(zip(moments, runs, strict=True)):
             tick(len(values))
             for part in evidence if what else ():
@@ -112,20 +112,13 @@ def _patch_of(points: Tensor) -> Tensor:
     return cell[:, 0] * PATCHES + cell[:, 1]
 
 
-def explained(
-    simulation: Simulation,
-    videos: Sequence[Footage],
-    tracks: Sequence[Tracks],
-    values: Values,
-    times: Sequence[float],
-) -> dict[str, float]:
-    """The share of the motion of tracks that were not fitted which a simulation explains, by camera, 0 to 1.
+def explained(parts: Sequence[Evidence], values: Values, times: Sequence[float]) -> dict[str, float]:
+    """The share of the motion of tracks that were not fitted which their simulation explains, by camera, 0 to 1.
 
     A track that slipped off the object explains nothing, no less: one of them would decide the sum of all.
     """
-    parts = [Evidence(simulation, video, split(own)[1]) for video, own in zip(videos, tracks, strict=True)]
     sums = [torch.zeros(2, len(part.rest), dtype=torch.float64) for part in parts]
-    for number, frame, pixel in _pixels(simulation, parts, values, times):
+    for number, frame, pixel in _pixels(parts, values, times):
         part = parts[number]
         seen = part.tracks.seen[frame]
         there = part.tracks.position[frame, seen]
@@ -148,11 +141,7 @@ def split(tracks: Tracks) -> tuple[Tracks, Tracks]:
 
 
 def trusted(
-    simulation: Simulation,
-    others: Sequence[Simulation],
-    evidence: Sequence[Evidence],
-    values: Values,
-    times: Sequence[float],
+    evidence: Sequence[Evidence], others: Sequence[Simulation], values: Values, times: Sequence[float]
 ) -> list[Evidence]:
     """Return evidence whose points count less where, and when, other grids move them otherwise.
 
@@ -161,10 +150,10 @@ def trusted(
     """
     if not others:
         return list(evidence)
-    own = {(number, frame): pixel for number, frame, pixel in _pixels(simulation, evidence, values, times)}
+    own = {(number, frame): pixel for number, frame, pixel in _pixels(evidence, values, times)}
     squares = {key: torch.zeros(len(pixel), dtype=torch.float64) for key, pixel in own.items()}
     for other in others:
-        for number, frame, pixel in _pixels(other, [part.on(other) for part in evidence], values, times):
+        for number, frame, pixel in _pixels([part.on(other) for part in evidence], values, times):
             off = torch.nan_to_num(pixel - own[number, frame])  # NaN: it diverged
             squares[number, frame] += off.square().sum(-1) / (2 * len(others))
     found = [copy(part) for part in evidence]
@@ -175,10 +164,8 @@ def trusted(
     return found
 
 
-def _pixels(
-    simulation: Simulation, parts: Sequence[Evidence], values: Values, times: Sequence[float]
-) -> Iterator[tuple[int, int, Tensor]]:
-    for time, states in zip(times, states_of(simulation, [values], times, alike=False), strict=True):
+def _pixels(parts: Sequence[Evidence], values: Values, times: Sequence[float]) -> Iterator[tuple[int, int, Tensor]]:
+    for time, states in zip(times, states_of(parts[0].simulation, [values], times, alike=False), strict=True):
         for number, part in enumerate(parts):
             if (frame := part.video.frame_at(time)) is not None:
                 yield number, frame, part.pixels(part.shown(states), frame)[0]

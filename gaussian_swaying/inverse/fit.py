@@ -134,8 +134,8 @@ class Course:
 class Problem:
     """The unknowns of a simulation, and the videos from which they are found.
 
-    ``grids`` are the simulation on other grids, ``looked`` sentences on cameras, and ``told`` and ``doubts`` what the
-    background says.
+    ``grids`` are the simulation on other grids, ``told`` what the background says, and ``doubts`` what speaks against
+    the videos.
     """
 
     def __init__(
@@ -145,13 +145,12 @@ class Problem:
         plan: Plan,
         say: Say | None = None,
         grids: Sequence[Simulation] = (),
-        looked: Sequence[str] = (),
         told: Sequence[str] = (),
         doubts: Sequence[str] = (),
     ) -> None:
         check_unknowns(simulation, plan.unknowns)
         self.simulation, self.videos, self.plan = simulation, list(videos), plan
-        self.say, self.grids, self.looked, self.told, self.doubts = say or Say(False), grids, looked, told, doubts
+        self.say, self.grids, self.told, self.doubts = say or Say(False), grids, told, doubts
         self.times = frame_times(videos)
         fitted = max(3, round(0.5 * len(self.times)))
         if plan.until is not None:
@@ -228,7 +227,7 @@ class Problem:
         return found
 
     def trusted(self, evidence: Sequence[Evidence], place: Sequence[float]) -> list[Evidence]:
-        return trusted(self.simulation, self.grids, evidence, self.values(place), self.fitted)
+        return trusted(evidence, self.grids, self.values(place), self.fitted)
 
     def _states(self, place: Sequence[float], times: Sequence[float]) -> list[State]:
         return [own[0] for own in states_of(self.simulation, [self.values(place)], times, alike=False)]
@@ -241,7 +240,7 @@ class Problem:
 
         def at(places: Tensor) -> Block:
             values = [self.values(place) for place in places]
-            return compare(self.simulation, evidence, values, times, self.moving, tick=self.say.tick)[0]
+            return compare(evidence, values, times, self.moving, tick=self.say.tick)[0]
 
         return at
 
@@ -282,7 +281,7 @@ class Problem:
             starts = [step * k for k in numbers] or [known.low]
         values, scale = [self.values(place) for place in places], COARSE * max(video.size[0] for video in self.videos)
         with self.say.work("search", len(places) * len(times)):
-            found = compare(self.simulation, evidence, values, times, self.moving, starts, self.say.tick)
+            found = compare(evidence, values, times, self.moving, starts, self.say.tick)
         costs, best = torch.stack([cost_of(block, scale) for block in found]).min(0)
         if known is not None:
             places[:, self.sought[FILM_START]] = torch.tensor([known.share(start) for start in starts]).double()[best]
@@ -416,11 +415,8 @@ class Problem:
     def result(self, course: Course, evidence: Sequence[Evidence], films: Path | None) -> Fit:
         place, values = torch.tensor(course.place, dtype=torch.float64), self.values(course.place)
         normal = linearised(self.residuals(evidence, self.fitted), place)
-        worse: dict[str, float] = {}
-        if films:
-            runs = states_of(self.simulation, [values], self.times, alike=False)
-            moved = (self.simulation.painter.deformed(state) for (state,) in runs)
-            worse = write_films(films, self.simulation, self.videos, self.times, len(self.fitted), moved)
+        pairs = zip(self.videos, self.tracks, strict=True)
+        held = [Evidence(self.simulation, video, split(own)[1]) for video, own in pairs]
         return Fit(
             self.plan.unknowns,
             tuple(course.place),
@@ -429,8 +425,8 @@ class Problem:
             course.seconds,
             "" if course.ended else UNSETTLED,
             tuple(self.notes()),
-            worse,
-            explained(self.simulation, self.videos, self.tracks, values, self.fitted),
+            write_films(films, held, values, self.times, len(self.fitted)) if films else {},
+            explained(held, values, self.fitted),
             consequences(self.plan.assumed, values, self.simulation),
             self.told,
             self.others(course.place, course.rivals),
@@ -440,11 +436,9 @@ class Problem:
         """The covariance that the grid adds at a place, (U, U): how far the minimum of another grid is."""
         found = torch.zeros(len(place), len(place), dtype=torch.float64)
         for other in self.grids:
-            own = [part.on(other) for part in evidence]
-            there = copy(self)
-            there.simulation = other
             with suppress(DivergedError):
-                end = there.solved(place.tolist(), own, self.fitted, REFINED, True).place
+                own = [part.on(other) for part in evidence]
+                end = self.solved(place.tolist(), own, self.fitted, REFINED, True).place
                 found += torch.outer(end - place, end - place)
         return found
 
@@ -458,8 +452,8 @@ class Problem:
                 "The camera was found from a frame in which the object may move already, so all values may be off: "
                 "give a film that begins at rest."
             )
-        found += [*self.doubts, *self.looked]
-        pairs = [] if self.looked or self.begins is not None else zip(self.videos, self.tracks, strict=True)
+        found += self.doubts
+        pairs = [] if self.doubts or self.begins is not None else zip(self.videos, self.tracks, strict=True)
         still = min((still_until(self.simulation, video, own) for video, own in pairs), default=0.0)
         if still >= LONG_STILL:
             found.append(
@@ -543,7 +537,7 @@ def _ready(plan: Plan, parser: Any, settings: Any, device: str, progress: bool) 
         videos, told, doubts = prepared(simulation, videos, plan.hand_held, plan.also_moves, say.tick)
     for line in told:
         say(line)
-    return Problem(simulation, videos, plan, say, _other_grids(simulation, say), looked, told, doubts)
+    return Problem(simulation, videos, plan, say, _other_grids(simulation, say), told, [*looked, *doubts])
 
 
 def _other_grids(simulation: Simulation, say: Say) -> list[Simulation]:

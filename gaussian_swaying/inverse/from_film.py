@@ -24,7 +24,7 @@ from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.gaussians.grouping import connected_parts
 from gaussian_swaying.gaussians.hold import given_hold
-from gaussian_swaying.gaussians.measures import DIRECTIONS
+from gaussian_swaying.gaussians.measures import DIRECTIONS, plane_axes, sides
 from gaussian_swaying.geometry.neighbours import particle_spacing
 from gaussian_swaying.inverse.fit import run_fit
 from gaussian_swaying.inverse.plan import FILM_START, SCALE, read_plan
@@ -52,10 +52,10 @@ from gaussian_swaying.suggestion.suggestion import Suggestion
 from gaussian_swaying.suggestion.up import given_up
 
 SIDE, SMALL = 960, 240  # longer sides of frames at most, and of those that show when it begins to move [pixels]
-MOVED_SHARE = 0.02  # share of points that have moved in a frame of a film in which something moves
+DIFFERENT, MOVED_SHARE = 8.0, 0.02  # grey levels by which a pixel has moved, and share of those in a frame
 DIAGONAL = math.hypot(36, 24)  # of the film to which a focal length in mm is equivalent [mm]
 FULL = 0.6  # share of the picture that a splat covers which has surroundings: then most of its points stand still
-STRAY, IN_A_ROW = 1.5, 3  # motion of a point [pixels], and frames in which some do where most of the picture is still
+STRAY, IN_A_ROW = 1.5, 3  # motion of a point where most of the picture is still [pixels], and frames in which some do
 LEAST_SHAKEN = 8  # fewest points that tell how a hand shakes
 END, FLAT, FEWEST = 0.12, 0.3, 5  # length of an end per the whole; of a direction per the longest; points of an end
 STILL, LEAST_MOTION = 0.35, 3.0  # motion of a held end per that of the liveliest quarter; least of that [pixels]
@@ -141,11 +141,10 @@ class Points:
         alpha = picture.alpha[..., 0].detach().cpu().numpy()
         cover = (cv2.resize(alpha, grey.shape[::-1], interpolation=cv2.INTER_AREA) > SOLID).astype(np.uint8)
         around = (cv2.dilate(cover, np.ones((15, 15), np.uint8)) == 0).astype(np.uint8)
-        places = corners(grey, 1200, 0.01, 4, cover | around)
-        own = cover[places.astype(int)[:, 1], places.astype(int)[:, 0]] > 0
-        self.start, self._count = np.concatenate([places[own], places[~own]]), int(own.sum())
-        self.full = len(places) - self._count < LEAST_SHAKEN and cover.mean() > FULL
-        self.world, self.known = in_space(picture, camera, places[own] * scale)
+        own, beside = (corners(grey, 600, 0.01, 4, mask) for mask in (cover, around))
+        self.start, self._count = np.concatenate([own, beside]), len(own)
+        self.full = len(beside) < LEAST_SHAKEN and cover.mean() > FULL
+        self.world, self.known = in_space(picture, camera, own * scale)
         self._lens = camera.intrinsics.double().numpy() / np.array([[scale], [scale], [1.0]])
 
     def far(self, place: Any, seen: Any, near: float) -> Any:
@@ -156,32 +155,53 @@ class Points:
             off = off_camera(self.world[used], there, self._lens, near)
             found[used] = np.nan if off is None else off
         else:
-            around, turn = seen.copy(), None
-            around[: self._count] = False
-            if around.sum() >= LEAST_SHAKEN:
-                turn = opencv().estimateAffinePartial2D(self.start[around], place[around], ransacReprojThreshold=1.5)[0]
-            turn = np.eye(2, 3) if turn is None else turn
+            turn = self.shake(place, seen)
             found[used] = np.linalg.norm(there - self.start[: self._count][used] @ turn[:, :2].T - turn[:, 2], axis=-1)
         return found
+
+    def shake(self, place: Any, seen: Any) -> Any:
+        around, turn = seen.copy(), None
+        around[: self._count] = False
+        if around.sum() >= LEAST_SHAKEN:
+            turn = opencv().estimateAffinePartial2D(self.start[around], place[around], ransacReprojThreshold=1.5)[0]
+        return np.eye(2, 3) if turn is None else turn
 
 
 def begins_to_move(film: Film, picture: RenderOutput, camera: Camera) -> float | None:
     """Time of the first frame in which the object, not only the camera, has moved [s]; None if there is none."""
+    cv2: Any = opencv()
     factor = max(1.0, max(film.width, film.height) / SMALL)
-    size = scaled(round(film.width / factor), round(film.height / factor))
-    with closing(frames_of(film.path, outputs=size, grey=True)) as frames:
+    size = round(film.width / factor), round(film.height / factor)
+    with closing(frames_of(film.path, outputs=scaled(*size), grey=True)) as frames:
         shape = next_of(frames, film.path)["size"][::-1]
         first = np.frombuffer(next_of(frames, film.path), dtype=np.uint8).reshape(shape)
-        points, number, in_a_row = Points(first, picture, camera), 0, 0
-        while in_a_row < (IN_A_ROW if points.full else 1):
-            if (frame := next_of(frames, film.path)) is None:
-                return None
+        cover = (
+            cv2.resize(picture.alpha[..., 0].detach().cpu().numpy(), shape[::-1], interpolation=cv2.INTER_AREA) > 0.3
+        )
+        inside = cover if cover.any() else ~cover
+        points, number, in_a_row = Points(first, picture, camera), 1, 0
+        while (frame := next_of(frames, film.path)) is not None:
             grey = np.frombuffer(frame, dtype=np.uint8).reshape(shape)
-            (_, place), (_, seen) = follow(np.stack([first, grey]), points.start)
-            far = points.far(place, seen, STRAY)
-            moved = (far > STRAY).sum() >= max(LEAST_SHAKEN, MOVED_SHARE * np.isfinite(far).sum())
-            number, in_a_row = number + 1, in_a_row + 1 if moved else 0
-    return (number + 1 - in_a_row) / film.fps
+            moved = _differs(first, grey, inside)
+            if moved:
+                (_, place), (_, seen) = follow(np.stack([first, grey]), points.start)
+                if points.full:
+                    far = points.far(place, seen, STRAY)
+                    moved = (far > STRAY).sum() >= max(LEAST_SHAKEN, MOVED_SHARE * np.isfinite(far).sum())
+                else:
+                    how = {"flags": cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
+                    moved = _differs(first, cv2.warpAffine(grey, points.shake(place, seen), shape[::-1], **how), inside)
+            in_a_row = in_a_row + 1 if moved else 0
+            if in_a_row == (IN_A_ROW if points.full else 1):
+                return (number + 1 - in_a_row) / film.fps
+            number += 1
+    return None
+
+
+def _differs(first: Any, grey: Any, where: Any) -> bool:
+    before, now = (picture[where].astype(float) for picture in (first, grey))
+    level = now * (before.mean() / max(now.mean(), 1.0))
+    return bool((abs(level - before) > DIFFERENT).mean() > MOVED_SHARE)
 
 
 def held_end(places: Tensor, moved: Tensor, up: Sequence[float]) -> tuple[str, float, float] | None:
@@ -338,11 +358,16 @@ def prepare(
         )
     write_starter(preview, folder / LOOK, 250)
     iio.imwrite(folder / LOOK / "preview.png", preview.picture())
-    text = plan_text(preview, _background(seen), None if at_once else moves - begin, length, folder)
+    around = seen.picture.alpha[..., 0].cpu() < 0.05  # the colour that most of it has is the background
+    pixels = seen.frame[around] if bool(around.any()) else seen.frame.flatten(0, 1)
+    colour = [round(value / 255, 3) for value in pixels.median(0).values.tolist()]
+    text = plan_text(preview, colour, None if at_once else moves - begin, length, folder)
     keep_aside(folder / PLAN, text)
     write_text(folder / PLAN, text)
     say(f"{film} moves from {moves:.2f} s on; {begin:.2f} s to {begin + seconds:.2f} s of it are used")
-    for line in [*lines, *(f"{name}: {preview.reasons[name]}" for name in ("up", "held", "size"))]:
+    for name in ("up", "held", "parts", "size"):
+        lines += [f"{name}: {preview.reasons[name]}"] if name in preview.reasons else []
+    for line in lines:
         say(line)
     if length is None:
         say("nobody measured the size: give --length, such as --length object 1.5")
@@ -371,13 +396,6 @@ def registered(
         f"{source} ({fov_of(found.camera):.0f} degrees from top to bottom)"
     )
     return Seen(head, frame, cloud, found.camera, picture, found.residual), told
-
-
-def _background(seen: Seen) -> list[float]:
-    """The colour that most of the first frame has where the splat is not, or all of it."""
-    around = seen.picture.alpha[..., 0].cpu() < 0.05
-    pixels = seen.frame[around] if bool(around.any()) else seen.frame.flatten(0, 1)
-    return [round(value / 255, 3) for value in pixels.median(0).values.tolist()]
 
 
 def _shown(seen: Seen, video: Footage, preview: Suggestion, wanted: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
@@ -441,12 +459,10 @@ def longest_side(name: str, metres: float, seen: Seen, preview: Suggestion) -> f
 
 def extent(points: Tensor, up: Sequence[float]) -> float:
     """The longest side of an upright box around points (N, 3) [scene units], turned as they are seen from above."""
-    axis = torch.nn.functional.normalize(torch.tensor(up, dtype=torch.float64), dim=0)
-    centred = points.double() - points.double().mean(0)
-    level = centred - (centred @ axis)[:, None] * axis
-    sides = torch.linalg.eigh(level.T @ level)[1].T[1:]
-    along = centred @ torch.cat([axis[None], sides]).T
-    return float((along.quantile(0.998, 0) - along.quantile(0.002, 0)).max())
+    axis, own = np.asarray(up) / np.linalg.norm(up), points.double().numpy()
+    level = own @ plane_axes(axis)
+    turned = level @ np.linalg.eigh(np.cov(level.T))[1]
+    return float(sides(np.column_stack([own @ axis, turned]), 0.002).max())
 
 
 def _place(name: str, number: int, seen: Seen) -> Tensor:

@@ -85,12 +85,6 @@ def moves_by(video: Footage, background: Background) -> float:
     return most
 
 
-def stands_still(video: Footage) -> bool:
-    """True if all frames of a video are said to have the same camera."""
-    views = torch.stack([camera.world_to_camera for camera in video.cameras])
-    return bool((views == views[:1]).all())
-
-
 def follow_camera(
     video: Footage, background: Background, tick: Callable[[int], object] = int
 ) -> tuple[Footage, tuple[int, ...], float]:
@@ -203,7 +197,8 @@ def prepared(
         return list(videos), [], []
     found, told, doubts = [], list[str](), list[str]()
     for video in videos:
-        moved = moves_by(video, background) if hand_held is not False and stands_still(video) else 0.0
+        still = all(torch.equal(video.cameras[0].world_to_camera, camera.world_to_camera) for camera in video.cameras)
+        moved = moves_by(video, background) if still and hand_held is not False else 0.0
         if hand_held or (moved > STILL and hand_held is None):
             video, unseen, residual = follow_camera(video, background, tick)
             told.append(

@@ -134,9 +134,8 @@ def _beside(place: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True, eq=False)
 class Normal:
-    """Normal equations at a point: J^T W r (U,), J^T W J (U, U), and the gradients of both kinds of clusters (C, U)."""
+    """Normal equations at a point: J^T W J (U, U), and the parts J^T W r of both kinds of clusters (C, U)."""
 
-    gradient: Tensor
     matrix: Tensor
     scores: tuple[Tensor, Tensor]
 
@@ -172,4 +171,4 @@ def linearised(residuals: Residuals, place: Tensor, scale: Callable[[Block], flo
     flat = (change * weight.sqrt()).flatten(1)
     moment = torch.zeros_like(block.cluster) if block.moment is None else block.moment
     scores = [own.new_zeros(1 + int(one.max()), unknowns).index_add(0, one, own) for one in (block.cluster, moment)]
-    return Normal(own.sum(0), flat @ flat.mT, (scores[0], scores[1]))
+    return Normal(flat @ flat.mT, (scores[0], scores[1]))

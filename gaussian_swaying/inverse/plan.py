@@ -134,20 +134,15 @@ def at_scale(model: Model, metres_per_unit: float) -> Model:
     """A model, whose values are meant in metres, that moves as if a scene unit had another length [m]."""
     wind, scene = model.wind, model.scene
     gravity, sheet = model.value("solver.gravity"), not scene.filled
-    if not any(gravity):
-        raise ValueError(f"Without gravity nothing tells `{SCALE}`: set `solver.gravity`, or measure a length.")
-    only = f"`{SCALE}` can be sought only"
-    if not isinstance(wind, WindField) or len(wind.modulations) or len(wind.effects) or model.air or model.forces:
-        raise ValueError(
-            f"{only} in a plain wind: remove `wind.modulations`, `wind.effects`, `air` and `forces`, or measure a "
-            "length."
-        )
-    if model.material.volume != "patch" or model.points.count != scene.on_surface + scene.filled:
-        raise ValueError(f"{only} with `material.volume: patch` and `scene.layers: 1`: set them, or measure a length.")
+    single = model.material.volume == "patch" and model.points.count == scene.on_surface + scene.filled
     bending = model.points.bending
-    if bending is not None and (isinstance(model.material.bending, str) or model.material.regions):
+    single &= bending is None or not (isinstance(model.material.bending, str) or model.material.regions)
+    single &= any(gravity) and not (model.air or model.forces)
+    if not (single and isinstance(wind, WindField)) or len(wind.modulations) or len(wind.effects):
         raise ValueError(
-            f"{only} with one `material.bending` in N m: give it as a number and without parts, or measure a length."
+            f"`{SCALE}` can be sought only under `solver.gravity`, in a plain wind (no `wind.modulations`, "
+            "`wind.effects`, `air` and `forces`), with `material.volume: patch`, `scene.layers: 1` and no or one "
+            "`material.bending` in N m: set them, or measure a length."
         )
     ratio = metres_per_unit / scene.frame.metres_per_unit
     changes = {"material.E": model.value("material.E") / ratio ** (3 if sheet else 2)}

@@ -110,18 +110,14 @@ def transforms(camera: Camera, film: str, origin: Origin) -> dict[str, Any]:
 def find_camera(draw: Draw, frame: Tensor, start: Sequence[Camera], *, focal: bool = False) -> Registration:
     """Find the camera of a frame, uint8 (H, W, 3), of something at rest, without lens distortion.
 
-    Of the cameras to start with, that with the most matches is taken; one is enough within some 20 degrees. The
-    ``focal`` length needs depth in what is seen.
+    Of the cameras to start with, of the frame's size, that with the most matches is taken; one is enough within some 20
+    degrees. The ``focal`` length needs depth in what is seen.
 
     Raises:
-        ValueError: If the frame and the cameras do not fit, or the splat is not found in the frame.
+        ValueError: If the splat is not found in the frame.
     """
-    cv2 = opencv()
-    height, width = frame.shape[:2]
-    if not start or any((camera.width, camera.height) != (width, height) for camera in start):
-        raise ValueError(f"Expected `start` to be cameras of the frame's size, {width} x {height}.")
     grey = grey_of(frame)
-    sift = cv2.SIFT_create(nfeatures=4000, contrastThreshold=0.02)
+    sift = opencv().SIFT_create(nfeatures=4000, contrastThreshold=0.02)
     wanted = sift.detectAndCompute(grey, None)
     tried = [_by_features(sift, wanted, draw(camera), camera) for camera in start]
     best = max((one for one in tried if one is not None), key=lambda one: one.agreeing, default=None)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,9 +17,10 @@ from torch import Tensor
 
 from gaussian_swaying._files import write_json, write_table, write_text
 from gaussian_swaying.config.parser import config_text
-from gaussian_swaying.gaussians.model import DeformedGaussians
-from gaussian_swaying.inverse.plan import SCALE, Unknown, of_simulation, values_at
+from gaussian_swaying.inverse.evidence import Evidence
+from gaussian_swaying.inverse.plan import SCALE, Unknown, Values, of_simulation, values_at
 from gaussian_swaying.inverse.tracks import Tracks, opencv, picture_of
+from gaussian_swaying.inverse.variants import states_of
 from gaussian_swaying.inverse.videos import Footage
 from gaussian_swaying.recording.video import VideoEncoder
 from gaussian_swaying.rendering.protocol import RenderOutput
@@ -148,18 +149,14 @@ class Fit:
 
 
 def write_films(
-    folder: Path,
-    simulation: Simulation,
-    videos: Sequence[Footage],
-    times: Sequence[float],
-    fitted: int,
-    moved: Iterable[DeformedGaussians],
+    folder: Path, parts: Sequence[Evidence], values: Values, times: Sequence[float], fitted: int
 ) -> dict[str, float]:
-    """Write ``film_CAMERA.mp4``, the whole video beside all Gaussians at each time, of which so many were fitted.
+    """Write ``film_CAMERA.mp4``, each whole video beside its simulation at all times, of which so many were fitted.
 
     Returns:
         For each camera the loss of PSNR of the fitted frames against the first one [dB].
     """
+    simulation, videos = parts[0].simulation, [part.video for part in parts]
     encoders, errors = list[VideoEncoder](), {video.name: list[float]() for video in videos}
     folder.mkdir(exist_ok=True)
     with ExitStack() as left:
@@ -167,7 +164,8 @@ def write_films(
             rate = (len(video.times) - 1) / (video.times[-1] - video.times[0])
             encoders.append(VideoEncoder(folder / f"film_{video.name}.mp4", rate))
             left.callback(encoders[-1].abort)
-        for k, (time, gaussians) in enumerate(zip(times, moved, strict=True)):
+        for k, (state,) in enumerate(states_of(simulation, [values], times, alike=False)):
+            time, gaussians = times[k], simulation.painter.deformed(state)
             title = "predicted" if k >= fitted else "fitted"
             for encoder, video in zip(encoders, videos, strict=True):
                 if (frame := video.frame_at(time)) is not None:
@@ -177,7 +175,8 @@ def write_films(
                     errors[video.name] += [float((shown - real).square().mean())] if k < fitted else []
         for encoder in encoders:
             encoder.finish()
-    return {name: 10 * math.log10(max(sum(e) / len(e), 1e-12) / max(e[0], 1e-12)) for name, e in errors.items()}
+    shares = {name: max(sum(own) / len(own), 1e-12) / max(own[0], 1e-12) for name, own in errors.items() if own}
+    return {name: 10 * math.log10(share) for name, share in shares.items()}
 
 
 def write_results(

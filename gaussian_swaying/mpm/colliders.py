@@ -123,6 +123,8 @@ class Wall(Boundary):
 
     needs_position = True
     recordable = True
+    point: Tensor
+    normal: Tensor
 
     def __init__(
         self,
@@ -149,8 +151,6 @@ class Wall(Boundary):
             n = torch.tensor(shape.normal, dtype=torch.float64)
             self.register_buffer("point", torch.tensor(shape.point, dtype=torch.float64))
             self.register_buffer("normal", n / n.norm())
-        self.point: Tensor
-        self.normal: Tensor
 
     @property
     def sides(self) -> Sequence[Wall]:
@@ -193,6 +193,7 @@ class VelocityBox(Boundary):
     """
 
     needs_position = True
+    velocity: Tensor
 
     def __init__(
         self,
@@ -204,7 +205,6 @@ class VelocityBox(Boundary):
         super().__init__(start, end)
         self.region, self.recordable = region, region.recordable
         self.register_buffer("velocity", torch.tensor(check_vector("velocity", velocity), dtype=torch.float64))
-        self.velocity: Tensor
 
     def in_frame(self, frame: SimFrame) -> VelocityBox:
         """The box with its region evaluated in metres."""
@@ -236,6 +236,10 @@ class Obstacle(Boundary):
 
     needs_position = True
     recordable = True
+    center: Tensor
+    keys: Tensor
+    numbers: Tensor
+    table: Tensor
 
     def __init__(
         self,
@@ -255,10 +259,6 @@ class Obstacle(Boundary):
         self.register_buffer("center", torch.tensor(shape.middle or (0.0, 0.0, 0.0), dtype=torch.float64))
         for name, value in {"keys": (path or KeyedPath([0.0])).keys(), **self._solid(None)}.items():
             self.register_buffer(name, value)
-        self.center: Tensor
-        self.keys: Tensor
-        self.numbers: Tensor
-        self.table: Tensor
 
     def _solid(self, frame: SimFrame | None) -> dict[str, Tensor]:
         axes = rotation_of(torch.deg2rad(torch.tensor(self.rotation, dtype=torch.float64)))

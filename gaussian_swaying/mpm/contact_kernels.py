@@ -14,6 +14,7 @@ from gaussian_swaying.geometry.linalg_triton import (
     load3,
     matvec,
     plus_identity,
+    scale3,
     store3,
     transpose,
     where3,
@@ -457,12 +458,11 @@ def _impulses(
     whether to restart the momentum.
     """
     plane = slots * places
-    v0 = tl.load(moving + p * 4, mask, 0.0)
-    v1 = tl.load(moving + p * 4 + 1, mask, 0.0)
-    v2 = tl.load(moving + p * 4 + 2, mask, 0.0)
+    v = vector(moving + p * 4, mask)
     own = tl.load(moving + p * 4 + 3, mask, 0.0)
     zero = tl.zeros([BLOCK], tl.float32)
-    d0, d1, d2, e0, e1, e2, worst, back = zero, zero, zero, zero, zero, zero, zero, zero
+    nothing = (zero, zero, zero)
+    d, e, worst, back = nothing, nothing, zero, zero
     for s in range(0, tl.max(count)):
         acts = s < count
         at = s * places + p
@@ -470,74 +470,43 @@ def _impulses(
         pair = acts & (q >= 0)
         to = moving + tl.maximum(q, 0) * 4
         sign = tl.where((q >= 0) & (p > q), -1.0, 1.0)
-        n0 = tl.load(data + at, acts, 0.0)
-        n1 = tl.load(data + plane + at, acts, 0.0)
-        n2 = tl.load(data + 2 * plane + at, acts, 0.0)
-        r0 = sign * (v0 - tl.load(to, pair, 0.0))
-        r1 = sign * (v1 - tl.load(to + 1, pair, 0.0))
-        r2 = sign * (v2 - tl.load(to + 2, pair, 0.0))
+        n = load3(data, plane, at, acts)
+        r = scale3(sign, add3(v, -1.0, vector(to, pair)))
         both = own + tl.load(to + 3, pair, 0.0)
         mu = friction
         if WALLS > 0:
             held = acts & (q < 0)
             wall = tl.where(held, -1 - q, 0)
             drive = wall_drive + (wall * places + p) * 3
-            r0 -= tl.load(drive, held, 0.0)
-            r1 -= tl.load(drive + 1, held, 0.0)
-            r2 -= tl.load(drive + 2, held, 0.0)
+            r = (
+                r[0] - tl.load(drive, held, 0.0),
+                r[1] - tl.load(drive + 1, held, 0.0),
+                r[2] - tl.load(drive + 2, held, 0.0),
+            )
             mu = tl.where(held, tl.load(wall_friction + wall, held, 0.0), friction)
-        along = r0 * n0 + r1 * n1 + r2 * n2
+        along = dot3(r, n)
         step = tl.where(both > 0, 1 / tl.where(both > 0, both, 1.0), 0.0)
         lacking = tl.where(acts, tl.load(data + 3 * plane + at, acts, 0.0) - along, 0.0)
         worst = tl.maximum(worst, lacking)
-        y = data + 4 * plane + at
-        t = data + 7 * plane + at
-        y0 = tl.load(y, acts & later, 0.0)
-        y1 = tl.load(y + plane, acts & later, 0.0)
-        y2 = tl.load(y + 2 * plane, acts & later, 0.0)
-        o0 = tl.load(t, acts & later, 0.0)
-        o1 = tl.load(t + plane, acts & later, 0.0)
-        o2 = tl.load(t + 2 * plane, acts & later, 0.0)
-        ahead = y0 * n0 + y1 * n1 + y2 * n2
+        y = load3(data + 4 * plane, plane, at, acts & later)
+        o = load3(data + 7 * plane, plane, at, acts & later)
+        ahead = dot3(y, n)
         press = tl.maximum(ahead + step * lacking, 0.0)
-        t0 = KEPT * (y0 - ahead * n0) - step * (r0 - along * n0)
-        t1 = KEPT * (y1 - ahead * n1) - step * (r1 - along * n1)
-        t2 = KEPT * (y2 - ahead * n2) - step * (r2 - along * n2)
-        length = tl.sqrt(tl.maximum(t0 * t0 + t1 * t1 + t2 * t2, 1.2e-38))
-        share = tl.minimum(mu * press / length, 1.0)
-        t0 = press * n0 + share * t0
-        t1 = press * n1 + share * t1
-        t2 = press * n2 + share * t2
-        turned = (y0 - t0) * (t0 - o0) + (y1 - t1) * (t1 - o1) + (y2 - t2) * (t2 - o2)
+        t = axpy3(KEPT, add3(y, -ahead, n), -step, add3(r, -along, n))
+        share = tl.minimum(mu * press / tl.sqrt(tl.maximum(dot3(t, t), 1.2e-38)), 1.0)
+        t = axpy3(press, n, share, t)
+        turned = dot3(add3(y, -1.0, t), add3(t, -1.0, o))
         back += tl.where(acts & (sign > 0), turned, 0.0)  # a pair once
-        tl.store(t, t0, acts)
-        tl.store(t + plane, t1, acts)
-        tl.store(t + 2 * plane, t2, acts)
+        store3(data + 7 * plane, plane, at, t, acts)
         if WALLS > 0:
-            press_to = pressed + (wall * places + p) * 3
-            tl.store(press_to, tl.where(final, t0, o0), held)
-            tl.store(press_to + 1, tl.where(final, t1, o1), held)
-            tl.store(press_to + 2, tl.where(final, t2, o2), held)
+            store3(pressed, 1, (wall * places + p) * 3, where3(final, t, o), held)
         sign = tl.where(acts, sign, 0.0)
-        e0 += sign * (o0 - y0)
-        e1 += sign * (o1 - y1)
-        e2 += sign * (o2 - y2)
-        t0 += momentum * (t0 - o0)
-        t1 += momentum * (t1 - o1)
-        t2 += momentum * (t2 - o2)
-        tl.store(y, t0, acts)
-        tl.store(y + plane, t1, acts)
-        tl.store(y + 2 * plane, t2, acts)
-        d0 += sign * (t0 - y0)
-        d1 += sign * (t1 - y1)
-        d2 += sign * (t2 - y2)
-    to = impulse + p * 8
-    tl.store(to, d0, mask)
-    tl.store(to + 1, d1, mask)
-    tl.store(to + 2, d2, mask)
-    tl.store(to + 4, e0, mask)
-    tl.store(to + 5, e1, mask)
-    tl.store(to + 6, e2, mask)
+        e = add3(e, sign, add3(o, -1.0, y))
+        t = add3(t, momentum, add3(t, -1.0, o))
+        store3(data + 4 * plane, plane, at, t, acts)
+        d = add3(d, sign, add3(t, -1.0, y))
+    store3(impulse, 1, p * 8, d, mask)
+    store3(impulse, 1, p * 8 + 4, e, mask)
     return worst, back
 
 

@@ -150,14 +150,14 @@ class EmbeddedAtPoints(EmbeddedPoints):
     """
 
     reads = ("position", "F_total")
+    source: Tensor
+    rest: Tensor
 
     def __init__(self, source: Tensor, arm: Tensor | None, rest: Tensor, attached: Tensor | None = None) -> None:
         super().__init__(arm)
         self._attached = attached
         self.register_buffer("source", source, persistent=False)
         self.register_buffer("rest", rest, persistent=False)
-        self.source: Tensor
-        self.rest: Tensor
 
     @property
     def places(self) -> Tensor:
@@ -190,12 +190,12 @@ class EmbeddedInGrid(EmbeddedPoints):
     """
 
     reads = ("node_displacement",)
+    place: Tensor
 
     def __init__(self, place: Tensor, arm: Tensor | None, nodes: Tensor | None = None) -> None:
         super().__init__(arm)
         self.register_buffer("place", place, persistent=False)
         self.register_buffer("own_nodes", nodes, persistent=False)
-        self.place: Tensor
         self.own_nodes: Tensor | None
         self._known: tuple[GridSpec, torch.device, Stencil] | None = None
 

@@ -73,6 +73,20 @@ class Joints(Force):
     """
 
     recordable = True
+    stiffness: Tensor
+    turning: Tensor
+    index: Tensor
+    of: Tensor
+    mass: Tensor
+    arm: Tensor
+    size: Tensor
+    whole: Tensor
+    offset: Tensor
+    extra: Tensor
+    owner: Tensor
+    sign: Tensor
+    place: Tensor
+    still: Tensor
 
     def __init__(self, points: MaterialPoints, joints: Sequence[PointJoint], longest: float) -> None:
         super().__init__()
@@ -120,20 +134,6 @@ class Joints(Force):
         }
         for name, value in buffers.items():
             self.register_buffer(name, value)
-        self.stiffness: Tensor
-        self.turning: Tensor
-        self.index: Tensor
-        self.of: Tensor
-        self.mass: Tensor
-        self.arm: Tensor
-        self.size: Tensor
-        self.whole: Tensor
-        self.offset: Tensor
-        self.extra: Tensor
-        self.owner: Tensor
-        self.sign: Tensor
-        self.place: Tensor
-        self.still: Tensor
 
     @staticmethod
     def _mean(field: Tensor, mass: Tensor, whole: Tensor, of: Tensor) -> Tensor:

@@ -144,6 +144,9 @@ class PinnedRegion(ParticleBoundary):
 
     recordable = True
     pinned_share = NODE_SHARE
+    velocity: Tensor
+    axis: Tensor
+    pivot: Tensor
 
     def __init__(
         self,
@@ -178,9 +181,6 @@ class PinnedRegion(ParticleBoundary):
             if not math.isfinite(self.end):
                 raise ValueError(f"Expected `end` of a PinnedRegion with a `front` to be a finite time, but got {end}.")
         self.register_buffer("front", ends)
-        self.velocity: Tensor
-        self.axis: Tensor
-        self.pivot: Tensor
         self.front: Tensor | None
 
     @property
@@ -283,6 +283,7 @@ class PinnedPoints(Boundary):
     """
 
     recordable = True
+    at: Tensor
 
     def __init__(
         self, at: Sequence[Sequence[float]], kind: str = "hinge", *, start: float = 0.0, end: float | None = None
@@ -293,7 +294,6 @@ class PinnedPoints(Boundary):
             raise ValueError("Expected `at` of the PinnedPoints to name at least one place, but it is empty.")
         self.kind = kind
         self.register_buffer("at", torch.tensor([check_vector("at", place) for place in at], dtype=torch.float64))
-        self.at: Tensor
 
     def in_frame(self, frame: SimFrame) -> PinnedPoints:
         """The same places in metres."""
@@ -330,6 +330,8 @@ class Impulse(ParticleBoundary):
 
     recordable = True
     turn = 0
+    impulse: Tensor
+    count: Tensor
 
     def __init__(
         self,
@@ -343,11 +345,9 @@ class Impulse(ParticleBoundary):
         if not math.isfinite(self.end):
             raise ValueError(f"Expected `end` of the Impulse to be a finite time, but got {end}.")
         self.register_buffer("impulse", torch.tensor(check_vector("impulse", impulse), dtype=torch.float64))
-        self.impulse: Tensor
         self.per_particle = bool(per_particle)
         # number of particles in each scene of the batch, once known
         self.register_buffer("count", torch.ones((), dtype=torch.float64), persistent=False)
-        self.count: Tensor
 
     def particle_mask(self, rest_position: Tensor) -> Tensor:
         """Particles inside the region at rest, which are also counted; ValueError if there are none."""

@@ -142,10 +142,6 @@ class Solver(nn.Module, ABC):
         """Continue the motion of another solver from its ``state``; None if this solver cannot."""
         return None
 
-    def domain(self, state: Any) -> tuple[Sequence[float], Sequence[float]]:
-        """Lower and upper corner of the space that the solver covers now [m]."""
-        return state.position.amin(0).tolist(), state.position.amax(0).tolist()
-
     def describe(self, state: Any) -> dict[str, Any]:
         return {"formulation": self.formulation}
 

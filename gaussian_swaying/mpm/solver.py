@@ -237,12 +237,6 @@ class MPMSolver(Fixed, Solver):
             return after.shown(moved, *after.amplitudes(state.replace(modal=None)))
         return after.read_particles(moved, *state.nodal)
 
-    def domain(self, state: MPMState) -> tuple[list[float], list[float]]:
-        """Lower and upper corner of the grid [m]."""
-        grid = state.grid
-        low = [first * grid.dx for first in grid.offset]
-        return low, [first + (n - 1) * grid.dx for first, n in zip(low, grid.resolution, strict=True)]
-
     def describe(self, state: MPMState) -> dict[str, Any]:
         """Formulation and grid, for the summary of a run."""
         grid = {"dx_m": self.dx, "resolution": list(state.grid.resolution)}

@@ -125,15 +125,15 @@ class Pull(Force):
     """
 
     recordable = True
+    held: Tensor
+    offset: Tensor
+    target: Tensor
 
     def __init__(self, share: Tensor, mass: Tensor, offset: Tensor, target: Tensor, frame: SimFrame) -> None:
         super().__init__()
         self.register_buffer("held", share * mass)
         self.register_buffer("offset", offset)
         self.register_buffer("target", target.clone())
-        self.held: Tensor
-        self.offset: Tensor
-        self.target: Tensor
         self._frame = frame
 
     @classmethod

@@ -62,7 +62,7 @@ def pixel_rays(camera: Camera) -> Tensor:
     return torch.stack([u, v, torch.ones_like(u)], dim=-1)
 
 
-def surface_maps(channels: Tensor, alpha: Tensor, camera: Camera, least_alpha: float = 0.5) -> SurfaceMaps:
+def surface_maps(channels: Tensor, alpha: Tensor, camera: Camera) -> SurfaceMaps:
     r"""The surface of a picture from its blended :func:`plane_channels`.
 
     With the blended normal :math:`N` and distance :math:`D`, both weighted alike, and the ray r of a pixel, the depth
@@ -78,7 +78,7 @@ def surface_maps(channels: Tensor, alpha: Tensor, camera: Camera, least_alpha: f
     length = normal.norm(dim=-1, keepdim=True)
     facing = (normal * rays).sum(-1, keepdim=True)
     with torch.no_grad():
-        known = (alpha > least_alpha) & (-facing > _GRAZING * length * rays.norm(dim=-1, keepdim=True))
+        known = (alpha > 0.5) & (-facing > _GRAZING * length * rays.norm(dim=-1, keepdim=True))
         known &= channels[..., 3:] < 0
     safe = torch.where(known, length, 1.0)
     depth = torch.where(known, channels[..., 3:] / torch.where(known, facing, 1.0), 0.0)

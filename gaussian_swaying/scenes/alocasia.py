@@ -12,7 +12,7 @@ from gaussian_swaying.scenes.plant_parts import Draw, bezier, leaf, pot
 from gaussian_swaying.scenes.stage import cast, floor
 
 
-def alocasia(spacing: float = 0.005, count: int = 8, seed: int = 0, size: float = 0.0) -> GaussianCloud:
+def alocasia(spacing: float = 0.005, count: int = 8, size: float = 0.0) -> GaussianCloud:
     """An alocasia (elephant's ear) about 1.1 m tall, in a pot on a floor at z = 0, z up; the soil is at 0.20 m.
 
     Each bent stalk has one broad blade of 38 cm.
@@ -22,7 +22,7 @@ def alocasia(spacing: float = 0.005, count: int = 8, seed: int = 0, size: float 
         size: Radius of a floor without shadows and with small Gaussians, where copies can stand [m]; 0 for the floor of
             one plant.
     """
-    h, draw = spacing, Draw(seed)
+    h, draw = spacing, Draw()
     shade = (cast((0.0, 0.0, 0.8), 0.50, 0.22), cast((0.0, 0.0, 0.1), 0.22, 0.5), (0.0, 0.0, 0.19, 0.55))
     flat = size
     far = max(flat, 0.9), max(flat + 2.0, 3.5)

@@ -12,7 +12,7 @@ from gaussian_swaying.scenes.plant_parts import Draw, bezier, leaf, pot, tints
 from gaussian_swaying.scenes.stage import cast, floor
 
 
-def ficus(spacing: float = 0.008, count: int = 2400, seed: int = 0) -> GaussianCloud:
+def ficus(spacing: float = 0.008, count: int = 2400) -> GaussianCloud:
     """A ficus tree 2 m tall, z up, in a pot on a floor at z = 0; the soil is at z = 0.30 m.
 
     The trunk rises from the soil to z = 1.25 m and has branches, twigs and leaves of 8 cm.
@@ -21,7 +21,7 @@ def ficus(spacing: float = 0.008, count: int = 2400, seed: int = 0) -> GaussianC
         spacing: Distance between Gaussians [m]; a leaf has at least one. On the trunk and branches it is at most 3 and
             4.5 cm, so that they stay stiff on a coarse grid.
     """
-    h, draw = spacing, Draw(seed)
+    h, draw = spacing, Draw()
     bark = (0.42, 0.33, 0.25)
     trunk = bezier([[0, 0, 0.28], [0.10, 0.02, 0.6], [-0.10, -0.03, 0.95], [0.02, 0.0, 1.25]])
     thick = torch.linspace(0.055, 0.026, len(trunk), dtype=torch.float64)

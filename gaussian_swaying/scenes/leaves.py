@@ -19,7 +19,7 @@ WOOD = (
 )
 
 
-def leafy_branch(spacing: float = 0.006, count: int = 150, seed: int = 0) -> GaussianCloud:
+def leafy_branch(spacing: float = 0.006, count: int = 150) -> GaussianCloud:
     """A leafy branch about 1.8 m long in the x-z plane, z up. Left of x = -0.9 m it continues without leaves.
 
     A straight branch with four straight twigs (:data:`WOOD`) and leaves of 17 cm.
@@ -27,7 +27,7 @@ def leafy_branch(spacing: float = 0.006, count: int = 150, seed: int = 0) -> Gau
     Args:
         spacing: Distance between Gaussians [m]; a leaf has at least one.
     """
-    h, draw = spacing, Draw(seed)
+    h, draw = spacing, Draw()
     ends = torch.tensor([piece[:2] for piece in WOOD], dtype=torch.float64)
     parts = []
     for piece, (_, _, radius) in zip(ends, WOOD, strict=True):

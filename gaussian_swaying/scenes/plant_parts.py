@@ -12,10 +12,10 @@ from gaussian_swaying.scenes.patches import Patches, disc, join, quads, revoluti
 
 
 class Draw:
-    """Random numbers of one scene, the same for the same seed on every machine."""
+    """Random numbers of one scene, the same on every machine."""
 
-    def __init__(self, seed: int) -> None:
-        self.generator = torch.Generator().manual_seed(int(seed))
+    def __init__(self) -> None:
+        self.generator = torch.Generator().manual_seed(0)
 
     def uniform(self, low: float, high: float, *shape: int) -> Tensor:
         """Uniform numbers of a shape, float64."""

@@ -30,17 +30,10 @@ class ProceduralScene(Fixed, ABC):
     def generate(self) -> GaussianCloud:
         """Make the splat; the same arguments give the same splat."""
 
-    def check(self, *positive: str, coarsest: float = math.inf) -> None:
-        """Raise ValueError unless ``spacing`` and the named numbers are positive.
-
-        Args:
-            coarsest: Largest spacing that resolves the scene [m].
-        """
-        given = vars(self)
+    def check(self, *positive: str) -> None:
+        """Raise ValueError unless ``spacing`` and the named numbers are positive."""
         for name in ("spacing", *positive):
-            check_positive(f"generator.{name}", given[name])
-        if given["spacing"] > coarsest:
-            raise ValueError(f"Expected `generator.spacing` of at most {coarsest} m, but got {given['spacing']} m.")
+            check_positive(f"generator.{name}", getattr(self, name))
 
 
 def both(first: GaussianCloud, second: GaussianCloud) -> GaussianCloud:

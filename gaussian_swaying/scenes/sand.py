@@ -42,7 +42,7 @@ def bear_height(x: Tensor, y: Tensor) -> Tensor:
     return top
 
 
-def sand_bear(spacing: float = 0.013, seed: int = 0, interior: bool = True) -> GaussianCloud:
+def sand_bear(spacing: float = 0.013, interior: bool = True) -> GaussianCloud:
     """A bear of sand lying on a beach, 2.3 m from head to foot, z up, the bear on z = 0.
 
     Dry sand has no cohesion, so the bear is made of mounds (:data:`MOUNDS`) that are nowhere steeper than
@@ -53,7 +53,7 @@ def sand_bear(spacing: float = 0.013, seed: int = 0, interior: bool = True) -> G
     Args:
         spacing: Distance between Gaussians [m], on the surface and inside.
     """
-    h, draw = spacing, Draw(seed)
+    h, draw = spacing, Draw()
     xs = torch.arange(-1.05, 1.05, h, dtype=torch.float64) + 0.5 * h
     ys = torch.arange(-1.10, 1.40, h, dtype=torch.float64) + 0.5 * h
     x, y = (part.reshape(-1) for part in torch.meshgrid(xs, ys, indexing="ij"))

@@ -45,7 +45,7 @@ def floor(
     rings = [revolution([[high, 0.0], [low, 0.0]], high - low, colour) for low, high in pairwise(edges)]
     ground = join(rings)
     x, y = ground.center[:, 0], ground.center[:, 1]
-    paint = torch.tensor(colour, dtype=torch.float64) * (1 + 0.015 * Draw(0).normal(len(ground), 1))
+    paint = torch.tensor(colour, dtype=torch.float64) * (1 + 0.015 * Draw().normal(len(ground), 1))
     for sx, sy, radius, depth in shadows:
         near = torch.exp(-((x - sx) ** 2 + (y - sy) ** 2) / radius**2)
         paint = paint * (1 - depth * near)[:, None]

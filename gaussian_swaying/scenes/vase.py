@@ -25,7 +25,7 @@ from gaussian_swaying.scenes.plant_parts import Draw, bezier, leaf, tints
 PETALS = ((0.93, 0.42, 0.52), (0.97, 0.80, 0.30), (0.95, 0.93, 0.90), (0.72, 0.36, 0.70))
 
 
-def vase(spacing: float = 0.004, count: int = 15, seed: int = 0) -> GaussianCloud:
+def vase(spacing: float = 0.004, count: int = 15) -> GaussianCloud:
     """A vase 0.30 m tall with a bunch of flowers, on a round chequered cloth, z up, the table top at z = 0.
 
     The mouth of the vase is at z = 0.30 m, and the flowers reach up to 0.62 m. The cloth has a radius of 0.34 m on the
@@ -34,7 +34,7 @@ def vase(spacing: float = 0.004, count: int = 15, seed: int = 0) -> GaussianClou
     Args:
         spacing: Distance between Gaussians [m].
     """
-    h, draw = spacing, Draw(seed)
+    h, draw = spacing, Draw()
     profile = bezier([[0.055, 0, 0.0], [0.16, 0, 0.05], [0.13, 0, 0.20], [0.02, 0, 0.22], [0.065, 0, 0.30]])
     jar = revolution(profile[:, [0, 2]], max(h, 0.005), (0.25, 0.42, 0.62))
     band = (jar.center[:, 2] - 0.12).abs() < 0.012

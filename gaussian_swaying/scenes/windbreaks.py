@@ -12,7 +12,7 @@ from gaussian_swaying.scenes.procedural import both
 from gaussian_swaying.scenes.stage import cast, floor
 
 
-def plant_row(spacing: float = 0.012, count: int = 60, seed: int = 0, plants: int = 5) -> GaussianCloud:
+def plant_row(spacing: float = 0.012, count: int = 60, plants: int = 5) -> GaussianCloud:
     """A row of leafy plants along x on a floor at z = 0, z up.
 
     Each has a stem of 1.1 m and leaves of 16 cm, and they stand 0.6 m apart, around x = 0.
@@ -20,7 +20,7 @@ def plant_row(spacing: float = 0.012, count: int = 60, seed: int = 0, plants: in
     Args:
         spacing: Distance between Gaussians [m]; a leaf has at least one.
     """
-    draw = Draw(seed)
+    draw = Draw()
     places = [(k - 0.5 * (plants - 1)) * 0.6 for k in range(plants)]
     shade = [cast((x, 0.0, 0.5), 0.3, 0.35) for x in places]
     parts: list[Patches] = [floor(max(2 * spacing, 0.03), (0.62, 0.58, 0.44), shade)]
@@ -45,7 +45,7 @@ def _plant(spacing: float, leaves: int, draw: Draw, x: float) -> list[Patches]:
     return [green, copies(blade, facing(way, up), size, spot, tints(draw, leaves))]
 
 
-def ficus_behind_wall(spacing: float = 0.008, count: int = 2400, seed: int = 0) -> GaussianCloud:
+def ficus_behind_wall(spacing: float = 0.008, count: int = 2400) -> GaussianCloud:
     """A :func:`~gaussian_swaying.scenes.ficus.ficus`, and a garden wall upwind of it, at x = -1.5 m, on its floor.
 
     The wall is 1.3 m high and 2.4 m long. The arguments are those of the tree, which comes first.
@@ -55,4 +55,4 @@ def ficus_behind_wall(spacing: float = 0.008, count: int = 2400, seed: int = 0) 
     course = torch.floor(z / 0.13)  # rows of stones, each shifted by a half
     joint = (z / 0.13 - course < 0.22) | ((y / 0.3 + 0.5 * course) % 1 < 0.1)
     wall = wall.painted((0.80, 0.76, 0.70), joint)
-    return both(ficus(spacing, count, seed), to_cloud(wall, two_sided=False))
+    return both(ficus(spacing, count), to_cloud(wall, two_sided=False))

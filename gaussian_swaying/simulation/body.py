@@ -1488,6 +1488,16 @@ class SimulatedScene(nn.Module):
         field: The materials of its Gaussians, or None.
     """
 
+    simulated: Tensor
+    carried: Tensor
+    owner: Tensor
+    in_wind: Tensor
+    rest_covariances: Tensor
+    rest_normals: Tensor
+    moving: Tensor
+    rest_facing: Tensor
+    identity: Tensor
+
     def __init__(
         self,
         scene: Scene,
@@ -1601,15 +1611,6 @@ class SimulatedScene(nn.Module):
         felt = body.samples.area[anchor] > 0
         self.register_buffer("in_wind", felt, persistent=False)
         self.register_buffer("identity", torch.eye(3, dtype=cloud.means.dtype), persistent=False)
-        self.simulated: Tensor
-        self.carried: Tensor
-        self.owner: Tensor
-        self.in_wind: Tensor
-        self.rest_covariances: Tensor
-        self.rest_normals: Tensor
-        self.moving: Tensor
-        self.rest_facing: Tensor
-        self.identity: Tensor
 
     def __repr__(self) -> str:
         return f"{len(self.model.means):,} Gaussians of which {len(self.moving):,} move by {self.points.count:,} points"

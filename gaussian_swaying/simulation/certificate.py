@@ -199,9 +199,9 @@ def error_of(motions: Sequence[Tensor], substeps: Sequence[int], frame_dt: float
 
     Returns:
         Root mean squares over the points in each frame [m]: ``error_m``, its parts ``grid_m``, ``substep_m`` and
-        ``model_m``, and the distance from rest ``motion_m``. ``trusted_s`` is the time up to which the error holds; ``chaos_s`` that
-        from which other substeps alone make another motion, or None; ``size_m`` the motion about its mean; and a
-        sentence.
+        ``model_m``, and the distance from rest ``motion_m``. ``trusted_s`` is the time up to which the error holds;
+        ``chaos_s`` that from which other substeps alone make another motion, or None; ``size_m`` the motion about its
+        mean; and a sentence.
     """
     run, coarse, other = motions
     size = float(_rms(run - run.mean(0)).square().mean().sqrt())

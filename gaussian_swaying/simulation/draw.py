@@ -58,6 +58,7 @@ class Painter(Fixed, nn.Module):
     """
 
     assignable = ("shader", "camera", "cameras", "background")
+    background: Tensor
 
     def __init__(
         self,
@@ -78,7 +79,6 @@ class Painter(Fixed, nn.Module):
         for name in self.cameras:
             check_camera_name(name)
         self.register_buffer("background", torch.tensor(background, dtype=torch.float32))
-        self.background: Tensor
         self._renderer = renderer
         self._moved, self._coloured = Replayed(), Replayed()
         self._rest: tuple[Camera, object, Tensor, Tensor] | None = None  # of many Gaussians that do not move
@@ -309,6 +309,9 @@ class CopiesPainter(Painter):
         parts: The other arguments of a :class:`Painter`.
     """
 
+    still: Tensor
+    held: Tensor
+
     def __init__(self, stepper: Stepper, *parts: Any) -> None:
         super().__init__(stepper, *parts)
         assert stepper.copies is not None
@@ -319,8 +322,6 @@ class CopiesPainter(Painter):
         moves[scene.moving], belongs[scene.simulated], belongs[scene.carried] = True, True, True
         self.register_buffer("still", (~belongs).nonzero()[:, 0], persistent=False)
         self.register_buffer("held", (belongs & ~moves).nonzero()[:, 0], persistent=False)
-        self.still: Tensor
-        self.held: Tensor
         means = scene.model.means.detach()[scene.simulated]
         placed = torch.stack([copies.place(k, means) for k in range(len(copies))])
         extent = (placed.amax((0, 1)) - placed.amin((0, 1))).amax()

@@ -65,6 +65,9 @@ class Copies(nn.Module):
         delay: Times by which the wind comes later [s], shape (B,), float64.
     """
 
+    rotation: Tensor
+    offset: Tensor
+
     def __init__(self, copies: Sequence[Copy], model: Model, solver: Solver) -> None:
         super().__init__()
         if model.forces:
@@ -86,8 +89,6 @@ class Copies(nn.Module):
         values = {"rotation": rotation, "offset": offset, "turn": turn, "shift": shift, "delay": delay}
         for name, value in values.items():
             self.register_buffer(name, value, persistent=False)
-        self.rotation: Tensor
-        self.offset: Tensor
 
     def __len__(self) -> int:
         return len(self.copies)

@@ -24,7 +24,6 @@ from gaussian_swaying.geometry.regions import Box, Cylinder, Not, Region, Union
 from gaussian_swaying.mpm.materials import known_material
 from gaussian_swaying.mpm.modes import MOST_LEAN
 from gaussian_swaying.simulation.measure import duration
-from gaussian_swaying.simulation.model import Model
 from gaussian_swaying.simulation.simulation import Simulation, classify, conditions
 from gaussian_swaying.suggestion.cost import Cost
 from gaussian_swaying.suggestion.kinds import KINDS
@@ -173,10 +172,6 @@ class Suggestion:
             text = self.to_yaml(Path(folder) / "starter.yaml", splat=self.path or Path("splat.ply"))
             settings = parse_text(parser, text, ["--device", device])
             return Simulation.from_settings(parser, settings, cloud=self.cloud)
-
-    def to_model(self, device: str = "auto") -> Model:
-        """The model of :meth:`to_simulation`: all that decides how it moves, without pictures and files."""
-        return self.to_simulation(device).model
 
     def to_yaml(self, file: str | os.PathLike[str], frames: int = 250, splat: Path | None = None) -> str:
         """Write the simulation as a configuration with a comment on each number, and beside it ``parts.npz``.

@@ -54,8 +54,7 @@ def open_folder(folder: Path, plan: Plan, resume: bool, together: int = 1) -> Fo
     if held and (old := read_record(folder)) != new:
         what = f"it has {len(old['runs'])} runs, and now there are {len(new['runs'])}"
         if len(old["runs"]) == len(new["runs"]):
-            what = first_change(json.dumps(old), json.dumps(new)).removeprefix("`config.")
-            what = f"`{what}" if not what.startswith(("`", "in")) else what
+            what = first_change(json.dumps(old), json.dumps(new))
         remedy = "restore them, or choose another --output."
         raise ValueError(f"{folder} holds a sweep with other settings ({what}): {remedy}")
     try:

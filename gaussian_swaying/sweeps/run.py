@@ -55,6 +55,7 @@ KILLED = 3  # times as many retries for a job whose process was killed, as the r
 LOCKED_S = 60.0  # how long to wait for a folder: the worker of a driver that was killed ends at its frame
 STOP_S = 300.0  # how long workers may take to write what they have when the sweep is stopped
 LOCAL = "local"
+EXTRAS = {"ray": ("ray", "ray"), "parquet": ("parquet", "pyarrow"), "shards": ("webdataset", "webdataset")}
 Explain = Callable[[BaseException], str]
 
 
@@ -430,17 +431,12 @@ def run_sweep(
     """
     folder = Path(output).absolute()
     check_choice("device", device, ("auto", "cpu", "cuda"))
-    for name, given, least in (
-        ("workers", workers, 1),
-        ("threads", threads, 1),
-        ("together", together, 1),
-        ("retries", retries, 0),
-    ):
+    check_whole("retries", retries, 0)
+    for name, given in (("workers", workers), ("threads", threads), ("together", together)):
         if given is not None:
-            check_whole(name, given, least)
-    for option, module, wanted in (("ray", "ray", ray is not None), ("parquet", "pyarrow", parquet)):
-        if wanted:
-            check_extra(option, module)
+            check_whole(name, given, 1)
+    for option in (["ray"] if ray is not None else []) + (["parquet"] if parquet else []):
+        check_extra(option)
     lock = open_folder(folder, plan, resume, together)
     try:
         results = {name: result for name in plan.names if (result := read_result(folder, name)) is not None}
@@ -485,8 +481,8 @@ def run_sweep(
         lock.release()
 
 
-def check_extra(option: str, module: str) -> None:
+def check_extra(option: str) -> None:
     """Raise ValueError if an option of the command needs a module that is not installed."""
+    extra, module = EXTRAS[option]
     if find_spec(module) is None:
-        extra = module.replace("pyarrow", "parquet")
         raise ValueError(f"`--{option}` needs {module}: install gaussian-swaying[{extra}], or leave it out.")

@@ -129,13 +129,13 @@ class AirPush(Force):
     """
 
     recordable = True
+    numbers: Tensor
 
     def __init__(self, points: int, like: Tensor) -> None:
         super().__init__()
         with torch.inference_mode(False):  # recorded steps write it outside that mode
             numbers = torch.zeros(points, 4, dtype=like.dtype, device=like.device)
         self.register_buffer("numbers", numbers, persistent=False)
-        self.numbers: Tensor
 
     def begin(self, at_rest: Tensor, rate: Tensor) -> None:
         """Start a step of the air, with a force at rest (P, 3) and its decrease per velocity (P,)."""

@@ -383,6 +383,9 @@ class AeroForce(Fixed, nn.Module):
 
     live_as = "aero"
     live = live_numbers(**{name: SIZE | {"differentiable": True} for name in ("C_D", "C_F", "C_L")}, added_mass=SIZE)
+    C_D: Tensor
+    C_F: Tensor
+    C_L: Tensor
 
     def __init__(
         self,
@@ -410,9 +413,6 @@ class AeroForce(Fixed, nn.Module):
         for name, value in (("C_D", C_D), ("C_F", C_F), ("C_L", C_L)):
             given = value.reshape(()).double() if isinstance(value, Tensor) and value.requires_grad else float(value)
             self.register_buffer(name, torch.as_tensor(given, dtype=torch.float64))
-        self.C_D: Tensor
-        self.C_F: Tensor
-        self.C_L: Tensor
         self.air_density, self.law, self.drag_step = float(air_density), law, drag_step
         self.max_area_ratio = math.inf if max_area_ratio is None else float(max_area_ratio)
         self.added_mass = float(added_mass)
@@ -555,12 +555,12 @@ class AirLift(Force):
     """
 
     recordable = True
+    force: Tensor
 
     def __init__(self, mass: Tensor, gravity: Sequence[float]) -> None:
         super().__init__()
         down = torch.tensor(list(gravity), dtype=torch.float64).to(mass)
         self.register_buffer("force", mass.detach()[..., None] * -down)
-        self.force: Tensor
 
     def potential(self, state: State) -> Tensor:
         """Potential energy of the force [J], shape (...) over the batch, float64."""
@@ -606,6 +606,9 @@ class WindForce(Force):
         torch.Size([4, 3])
     """
 
+    normal: Tensor
+    area: Tensor
+
     def __init__(
         self,
         aero: AeroForce,
@@ -636,8 +639,6 @@ class WindForce(Force):
         self.aero = aero
         self.register_buffer("normal", normal, persistent=False)
         self.register_buffer("area", area, persistent=False)
-        self.normal: Tensor
-        self.area: Tensor
         self._shared = scenes is None
         given = tuple(normal.shape[:-2])
         if scenes is not None and given not in ((scenes,), ()):  # () for all scenes alike

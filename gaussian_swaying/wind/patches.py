@@ -42,15 +42,16 @@ class Patches(nn.Module):
         count: Number of material points P.
     """
 
+    normal: Tensor
+    area: Tensor
+    point: Tensor
+
     def __init__(self, normal: Tensor, area: Tensor, point: Tensor, count: int) -> None:
         super().__init__()
         self.count = int(count)
         self.register_buffer("normal", normal, persistent=False)
         self.register_buffer("area", area, persistent=False)
         self.register_buffer("point", point, persistent=False)
-        self.normal: Tensor
-        self.area: Tensor
-        self.point: Tensor
 
     def areas(self) -> Tensor:
         """Area of the patches of each material point at rest [m²], shape (P,)."""
@@ -73,6 +74,10 @@ class PatchSums(nn.Module):
         single: Whether no point has patches of more than one direction.
     """
 
+    tensor: Tensor
+    vector: Tensor
+    point: Tensor
+
     def __init__(self, patches: Patches, coarse: bool = False, tensor: Tensor | None = None) -> None:
         super().__init__()
         like = patches.area
@@ -85,9 +90,6 @@ class PatchSums(nn.Module):
         self.register_buffer("vector", vector.to(like), persistent=False)
         self.register_buffer("point", owner.to(like.device), persistent=False)
         self.single = len(owner) == 0 or int(owner.bincount().amax()) <= 1
-        self.tensor: Tensor
-        self.vector: Tensor
-        self.point: Tensor
 
     def grouped(self, group: Tensor, count: int, coarse: bool = False) -> PatchSums:
         """The sums of groups of points.

@@ -62,7 +62,6 @@ def test_what_it_says(flag):
 
 def test_its_simulation_moves_the_cloth_in_its_wind(flag):
     simulation = flag.to_simulation("cpu")
-    assert torch.equal(flag.to_model("cpu").points.mass, simulation.scene.points.mass)
     assert float(simulation.wind.flows[0].norm()) == pytest.approx(6.0, abs=0.02)
     *_, last = simulation.frames(4)
     moved = (last.gaussians.means - simulation.scene.rest().means).norm(dim=-1)

@@ -5,7 +5,7 @@ import torch
 from small_films import changed
 
 import gaussian_swaying.inverse.evidence as module
-from gaussian_swaying.inverse.evidence import NOISE, PATCHES, Evidence, compare, explained, trusted
+from gaussian_swaying.inverse.evidence import NOISE, PATCHES, Evidence, compare, explained, split, trusted
 from gaussian_swaying.inverse.tracks import Tracks, track
 from gaussian_swaying.inverse.variants import states_of
 from gaussian_swaying.inverse.videos import read_videos
@@ -31,14 +31,14 @@ def test_a_track_that_slips_explains_nothing_and_no_less(own, simulation):
     assert moved[3] > 10 * slipped
     seen = torch.ones(position.shape[:2], dtype=torch.bool)
     tracks = Tracks(torch.arange(len(simulation.scene.moving))[-4:], position, seen)
-    found = explained(simulation, [video], [tracks], {}, video.times)[video.name]
+    found = explained([Evidence(simulation, video, split(tracks)[1])], {}, video.times)[video.name]
     assert found == pytest.approx(float(moved[:3].sum() / (moved[:3].sum() + slipped)), rel=1e-3)
 
 
 def test_tracks_share_their_clusters_over_cameras(own, simulation):
     """A track's error is that of a place of the object, whoever sees it."""
     parts = [_nothing(simulation, video) for video in read_videos(own / "video")]
-    (found,) = compare(simulation, parts, [{}, {}], parts[0].video.times[:3])
+    (found,) = compare(parts, [{}, {}], parts[0].video.times[:3])
     count = len(simulation.scene.moving)
     assert found.values.shape == (2, 2 * 2 * count, 2)  # two cameras at two times after the start
     own_clusters = found.cluster.reshape(4, count)
@@ -53,13 +53,13 @@ def left(own, simulation):
     return Evidence(simulation, video, track(simulation, video, 40))
 
 
-def test_points_count_by_how_far_another_grid_moves_them(own, simulation, left):
+def test_points_count_by_how_far_another_grid_moves_them(own, left):
     """By 1 / sqrt(1 + d^2 / n^2), with the distance d in each coordinate; at rest they count as before."""
     finer = changed(own, solver={"dx": 0.08})
     times = left.video.times[:7]
-    (part,) = trusted(simulation, [finer], [left], {}, times)
-    compared = {"own": (simulation, left), "other": (finer, left.on(finer)), "less": (simulation, part)}
-    values = {name: compare(scene, [e], [{}], times, moving=True)[0].values[0] for name, (scene, e) in compared.items()}
+    (part,) = trusted([left], [finer], {}, times)
+    compared = {"own": left, "other": left.on(finer), "less": part}
+    values = {name: compare([one], [{}], times, moving=True)[0].values[0] for name, one in compared.items()}
     away = (values["other"] - values["own"]).norm(dim=-1)
     expected = (1 + 0.5 * away.square() / NOISE**2).rsqrt()
     first = int(left.tracks.seen[0].sum())
@@ -77,5 +77,5 @@ def test_a_grid_on_which_the_scene_diverges_says_nothing(simulation, left, monke
         return [(*key, torch.nan * own if len(calls) == 2 else own) for *key, own in pixels(*given)]
 
     monkeypatch.setattr(module, "_pixels", lost)
-    (part,) = trusted(simulation, [simulation, simulation], [left], {}, left.video.times[:3])
+    (part,) = trusted([left], [simulation, simulation], {}, left.video.times[:3])
     assert (part.trust == 1).all()

@@ -28,10 +28,10 @@ def _film(path, frames, rate=25):
 
 
 def _square(left, light=1.0, noise=0.0, size=(96, 160)):
-    """A chequered square on grey, at a place."""
+    """A striped square on grey, at a place."""
     picture = np.full((*size, 3), 90.0)
-    cell = np.arange(40) // 5
-    picture[30:70, left : left + 40] = 60 + 120 * ((cell[:, None, None] + cell[:, None]) % 2)
+    stripes = 60 + 120 * (np.arange(40) // 4 % 2)
+    picture[30:70, left : left + 40] = stripes[None, :, None]
     picture = picture * light + noise * np.random.default_rng(int(left * 7 + 100 * light)).standard_normal(
         picture.shape
     )

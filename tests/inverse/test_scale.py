@@ -104,11 +104,11 @@ def test_what_has_a_length_of_its_own_is_refused(tmp_path):
     assert unknown.unit == "m"
     check_unknowns(made(tmp_path, 1.0), [unknown])
     gust = [{"class_path": "SineSway"}]
-    for changes, told in (
-        ({"wind": {"modulations": gust}}, "plain wind"),
-        ({"solver": {"gravity": [0.0, 0.0, 0.0]}}, "Without gravity"),
-        ({"scene": {"layers": 3}}, "scene.layers"),
-        ({"material": {"bending": "plate"}}, "one `material.bending` in N m"),
+    for changes in (
+        {"wind": {"modulations": gust}},
+        {"solver": {"gravity": [0.0, 0.0, 0.0]}},
+        {"scene": {"layers": 3}},
+        {"material": {"bending": "plate"}},
     ):
-        with value_error(told):
+        with value_error("only under `solver.gravity`, in a plain wind .* `scene.layers: 1` and"):
             check_unknowns(made(tmp_path, 1.0, **changes), [unknown])

@@ -135,9 +135,9 @@ def test_starts_that_are_compared_at_once(own, simulation):
     (video, _) = read_videos(own / "video")
     evidence = [Evidence(simulation, video, track(simulation, video))]
     times, starts = list(video.times[:5]), [-2 / 24, 0.0, 1 / 24]
-    together = compare(simulation, evidence, [{"wind.speed": 4.0}], times, True, starts)
+    together = compare(evidence, [{"wind.speed": 4.0}], times, True, starts)
     apart = [{"wind.speed": 4.0, FILM_START: start} for start in starts]
-    (block,) = compare(simulation, evidence, apart, times, moving=True)
+    (block,) = compare(evidence, apart, times, moving=True)
     for number, own_block in enumerate(together):
         assert own_block.values[0].shape == block.values[number].shape
         assert peak(own_block.values[0] - block.values[number]) < 0.02  # other steps

@@ -116,9 +116,8 @@ def test_the_cloud_has_the_patches_normals_sizes_and_light():
 
 
 def test_random_numbers_follow_the_seed():
-    assert torch.equal(Draw(3).normal(5), Draw(3).normal(5))
-    assert not torch.equal(Draw(3).normal(5), Draw(4).normal(5))
-    assert tints(Draw(0), 7).shape == (7, 3)
+    assert torch.equal(Draw().normal(5), Draw().normal(5))
+    assert tints(Draw(), 7).shape == (7, 3)
 
 
 def test_a_curve_of_bezier_meets_its_ends():

@@ -44,7 +44,7 @@ RUNS: list[Row] = [
     *({"cloth": "sail", "solver": "blender", "cells": cells} for cells in (24, 48, 120)),
     {"cloth": "sail", "solver": "blender", "cells": 120, "corner": 0.05},
     *({"cloth": "sail", "solver": "ours", "cells": cells} for cells in (24, 36, 48, 60)),
-    *({"cloth": "sail", "solver": "ours", "cells": 60, "corner": corner} for corner in (0.035, 0.045)),
+    *({"cloth": "sail", "solver": "ours", "cells": 60, "corner": corner} for corner in (0.025, 0.03, 0.035, 0.045)),
     {"cloth": "sail", "solver": "ours", "cells": 60, "bending": None},
 ]
 
@@ -65,7 +65,7 @@ def blender(cloth: FlagPattern, cells: int) -> np.ndarray:
     """The motion by Blender's springs."""
     cloth = replace(cloth, cells=cells)
     cloth = replace(cloth, quality=least_quality(cloth, 64))
-    path = MOTIONS / f"{cloth.pinned}_{cells}_{cloth.corner:g}.npz"
+    path = MOTIONS / f"{cloth.pinned}_{cells}_{cloth.corner:g}_{cloth.damping:g}.npz"
     solve_pattern(cloth, path)
     found = read_cloth(path)
     uv = found.uv.reshape(found.columns + 1, found.rows + 1, 2)
