@@ -18,21 +18,21 @@ FLAG = ["--config=configs/sim/flag.yaml", "--solver.dx=0.1", "--scene.region=Eve
         "--scene.generator.init_args={spacing: 0.025, stand: none}"]  # fmt: skip
 
 
-def simulation_of(thing: str) -> Simulation:
-    """The README's flag on half as many cells, or the starter of a plant that is made in code."""
+def simulation_of(thing: str, damping: float) -> Simulation:
+    """The README's flag on half as many cells with a damping [1/s], or the starter of a plant that is made in code."""
     if thing == "flag":
         parser = Simulation.parser()
-        return Simulation.from_settings(parser, parser.parse_args(FLAG))
+        return Simulation.from_settings(parser, parser.parse_args([*FLAG, f"--solver.damping={damping}"]))
     FOLDER.mkdir(parents=True, exist_ok=True)
     write_ply(FOLDER / "plant.ply", DemoScene("alocasia", spacing=0.01).generate())
     suggest(FOLDER / "plant.ply", look="gusts", device="cpu").to_yaml(FOLDER / "plant.yaml")
     return Simulation.from_yaml(FOLDER / "plant.yaml", device="cpu")
 
 
-@study("long", [{"thing": thing} for thing in ("flag", "plant")])
-def long(thing: str, minutes: float = MINUTES) -> Row:
+@study("long", [{"thing": "flag"}, {"thing": "plant"}, {"thing": "flag", "damping": 0.1, "minutes": 10}])
+def long(thing: str, minutes: float = MINUTES, damping: float = 0.0) -> Row:
     """Means and extremes of each part of the time: energy [J], stretch, and where the middle is [m]."""
-    simulation = simulation_of(thing)
+    simulation = simulation_of(thing, damping)
     begin, count, rows = time.perf_counter(), round(60 * minutes / simulation.frame_dt), []
     FOLDER.mkdir(parents=True, exist_ok=True)
     for frame in simulation.frames(count):
