@@ -315,9 +315,8 @@ def test_a_window_records_what_it_shows(page, drawing, tmp_path):
         window.get_by_role("button", name="Stop recording").click()
     assert download.value.suggested_filename == "wind.webm"
     download.value.save_as(tmp_path / "wind.webm")
-    frames = iio.imread(tmp_path / "wind.webm").astype(int)
-    assert len(frames) > 1
-    assert np.abs(frames[-1] - frames[0]).max() > 20  # it moves
+    first, *_, last = iio.imiter(tmp_path / "wind.webm", fps=10)  # the browser says 1000, which fills the memory
+    assert np.abs(last.astype(int) - first).max() > 20  # it moves
     window.get_by_role("button", name="Record a video").wait_for()
     assert window.problems == []
 
