@@ -53,19 +53,19 @@ def write_camera(options: argparse.Namespace) -> int:
     from gaussian_swaying.gaussians.formats import read_gaussians
     from gaussian_swaying.inverse import registration
     from gaussian_swaying.inverse.from_film import open_film
-    from gaussian_swaying.inverse.report import side_by_side, titled
+    from gaussian_swaying.inverse.report import side_by_side
 
     if options.fov is not None and not 0 < options.fov < 180:
         raise ValueError(f"Expected `--fov` to be between 0 and 180 degrees, but got {options.fov:g}.")
     film = check_regular(Path(options.film), "the film")
     still = film.suffix.lower() in registration.STILLS
-    frame = read_image(film)[..., :3].contiguous() if still else open_film(film, math.inf).first_frame()
+    frame = read_image(film)[..., :3].contiguous() if still else open_film(film, math.inf).first
     cloud = read_gaussians(options.splat, 0)
     found, picture = registration.register(frame, cloud, options.up, options.fov)
     folder = Path(options.output or Path("outputs") / "registered" / film.stem)
     folder.mkdir(parents=True, exist_ok=True)
     pictures, cameras = (folder / name for name in (registration.PICTURE, registration.CAMERAS))
-    Image.fromarray(titled(side_by_side(frame, picture))).save(pictures)
+    Image.fromarray(side_by_side(frame, picture)).save(pictures)
     write_json(cameras, registration.transforms(found.camera, os.path.relpath(film, folder), cloud.origin))
     print(
         f"{found.agreeing} of {found.matches} points agree on the camera, {found.residual:.2f} pixels off; its "

@@ -11,10 +11,10 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -22,20 +22,14 @@ from tqdm import tqdm
 
 from gaussian_swaying._files import write_json
 from gaussian_swaying._inputs import read_json
-from gaussian_swaying.inverse.evidence import (
-    Evidence,
-    compare,
-    explained,
-    split,
-    trusted,
-)
+from gaussian_swaying.config.parser import check_settings, option
 from gaussian_swaying.inverse.hand import prepared
 from gaussian_swaying.inverse.least_squares import (
-    Block,
     DivergedError,
     Residuals,
     Solved,
     cost_of,
+    covariance,
     linearised,
     solve,
 )
@@ -44,33 +38,25 @@ from gaussian_swaying.inverse.plan import (
     Plan,
     apart_by,
     check_apart,
-    check_unknowns,
-    is_mirrored,
+    make_plan,
     mirrored_place,
-    parse_base,
-    read_unknown,
+    turn,
     values_at,
 )
 from gaussian_swaying.inverse.registration import first_look
-from gaussian_swaying.inverse.report import (
-    BEFORE,
-    PICTURES,
-    Fit,
-    consequences,
-    write_before,
-    write_films,
-    write_page,
-    write_results,
-)
-from gaussian_swaying.inverse.tracks import Tracks, match, opencv, still_until, track
-from gaussian_swaying.inverse.variants import check_variants, states_of
+from gaussian_swaying.inverse.report import PICTURES, Fit, consequences, write_before, write_films, write_results
+from gaussian_swaying.inverse.tracks import Tracks, match, opencv, track
+from gaussian_swaying.inverse.variants import check_variants, compare, explained, split, states_of, trusted
 from gaussian_swaying.inverse.videos import Footage, frame_times, read_videos
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.runs.folder import MARKER, claim_folder, hold_folder
 from gaussian_swaying.simulation.measure import duration
 from gaussian_swaying.simulation.simulation import Simulation
 
-PROGRESS = "fit.json"
+if TYPE_CHECKING:
+    from jsonargparse import ArgumentParser, Namespace
+
+PROGRESS, FORMAT = "fit.json", 2
 OURS = (PROGRESS, "page.html", "values.csv", "result.json", "scene.yaml", PICTURES)
 
 UNSETTLED = "The values have not settled: `iterations` ran out: raise it and continue with --resume."
@@ -83,6 +69,7 @@ SPREAD = ("wind.speed", "wind.azimuth", "material.E")  # searched although a sta
 APART, SAME = 0.15, 0.03  # least distance of starts, and largest of ends that are the same, as shares of a range
 BRIEF, REFINED, TRIES = 4, 5, 2  # most iterations of a short solve, and on another grid; steps that are tried for each
 RIVAL, MIRRORED = 1.05, 1.25  # cost per the best below which another end is a rival; that of the mirrored wind
+MIRROR = 20.0  # largest angle between the wind of an end and the mirrored wind [degrees]
 GRIDS = (0.8, 1.25)  # cells of other grids that tell the error of the grid, per its own
 BEGUN, BEGINS, MOST_STARTS = 12, 10, 60  # simulations, starts of each at the first frame, and in the search
 LONG, COARSER = 300.0, 1.3  # time of a fit above which a coarser grid is proposed [s], and its cells
@@ -107,30 +94,6 @@ class Say:
         self.tick = lambda count: None
 
 
-@dataclass
-class Course:
-    """The resume state of a fit, as ``fit.json`` stores it; places are shares of the ranges.
-
-    Attributes:
-        step: Number of the step, of :data:`STEPS`; -1 before the end of the search, which found ``starts``.
-        first: The place whose simulation the first frame looks like; empty if it shows the scene at rest.
-        rivals: Where other starts ended.
-        matched: The place at which the current step began, and Gaussians were matched; empty before it.
-        tried: Steps that the solve of the last step has tried, and ``ended`` why it ended; empty if it did not.
-    """
-
-    step: int = -1
-    starts: list[list[float]] = field(default_factory=list)
-    place: list[float] = field(default_factory=list)
-    first: list[float] = field(default_factory=list)
-    rivals: list[list[float]] = field(default_factory=list)
-    matched: list[float] = field(default_factory=list)
-    tried: int = 0
-    ended: str = ""
-    history: list[dict[str, Any]] = field(default_factory=list)
-    seconds: float = 0.0
-
-
 class Problem:
     """The unknowns of a simulation, and the videos from which they are found.
 
@@ -148,7 +111,6 @@ class Problem:
         told: Sequence[str] = (),
         doubts: Sequence[str] = (),
     ) -> None:
-        check_unknowns(simulation, plan.unknowns)
         self.simulation, self.videos, self.plan = simulation, list(videos), plan
         self.say, self.grids, self.told, self.doubts = say or Say(False), grids, told, doubts
         self.times = frame_times(videos)
@@ -158,7 +120,7 @@ class Problem:
             if fitted < 3:
                 raise ValueError(f"Fewer than three frames lie before `until` = {plan.until:g} s: raise it.")
         self.fitted = self.times[:fitted]
-        check_variants(simulation)
+        check_variants(simulation, plan.unknowns)
         self.sought = {unknown.name: k for k, unknown in enumerate(plan.unknowns)}
         self.middle = [0.5 if u.start is None else u.share(u.start) for u in plan.unknowns]
         self.begins = plan.unknowns[self.sought[FILM_START]] if FILM_START in self.sought else None
@@ -194,10 +156,6 @@ class Problem:
         if list(first) != self.first:
             self.first, self._tracks = list(first), None
 
-    def look(self, folder: Path) -> list[Path]:
-        """Write pictures to look at before the fit, into ``before`` of a folder, and return them."""
-        return write_before(folder / BEFORE, self.simulation, self.videos, self.tracks)
-
     def begin_from(self, places: Tensor) -> list[float]:
         """Return the place of some (B, U), with its start, from whose pictures most Gaussians are found at first."""
         known = self.begins
@@ -216,17 +174,17 @@ class Problem:
                     found.append((sum(int(own.seen[0].sum()) for own in tracks), place))
         return max(found, key=itemgetter(0))[1]
 
-    def evidence(self, matched: Sequence[float] | None = None) -> list[Evidence]:
-        """What each video shows: points that are followed, or that are matched at a place."""
-        states = [] if matched is None else list(zip(self.fitted, self._states(matched, self.fitted), strict=True))
-        found = []
-        for k, video in enumerate(self.videos):
+    def evidence(self, matched: Sequence[float] | None = None) -> list[Tracks]:
+        """The fitted tracks of each video: points that are followed, or that are matched at a place."""
+        if matched is None:
+            return [split(own)[0] for own in self.tracks]
+        states, found = list(zip(self.fitted, self._states(matched, self.fitted), strict=True)), []
+        for video in self.videos:
             shown = [state for moment, state in states if video.frame_at(moment) is not None]
-            tracks = match(self.simulation, video, shown, self.plan.tracks, self.moving) if states else self.tracks[k]
-            found.append(Evidence(self.simulation, video, split(tracks)[0]))
+            found.append(split(match(self.simulation, video, shown, self.plan.tracks, self.moving))[0])
         return found
 
-    def trusted(self, evidence: Sequence[Evidence], place: Sequence[float]) -> list[Evidence]:
+    def trusted(self, evidence: Sequence[Tracks], place: Sequence[float]) -> list[Tracks]:
         return trusted(evidence, self.grids, self.values(place), self.fitted)
 
     def _states(self, place: Sequence[float], times: Sequence[float]) -> list[State]:
@@ -235,17 +193,12 @@ class Problem:
     def values(self, place: Tensor | Sequence[float]) -> dict[str, float]:
         return values_at(self.plan.unknowns, place)
 
-    def residuals(self, evidence: Sequence[Evidence], times: Sequence[float]) -> Residuals:
+    def residuals(self, evidence: Sequence[Tracks], times: Sequence[float]) -> Residuals:
         """The residuals of some evidence up to a horizon, as a function of places (B, U)."""
-
-        def at(places: Tensor) -> Block:
-            values = [self.values(place) for place in places]
-            return compare(evidence, values, times, self.moving, tick=self.say.tick)[0]
-
-        return at
+        return lambda places: compare(evidence, list(map(self.values, places)), times, self.moving, self.say.tick)[0]
 
     def solved(
-        self, place: Sequence[float], evidence: Sequence[Evidence], times: Sequence[float], most: int, closely: bool
+        self, place: Sequence[float], evidence: Sequence[Tracks], times: Sequence[float], most: int, closely: bool
     ) -> Solved:
         """Where the steps from a place end."""
         at = torch.tensor(place, dtype=torch.float64)
@@ -281,7 +234,7 @@ class Problem:
             starts = [step * k for k in numbers] or [known.low]
         values, scale = [self.values(place) for place in places], COARSE * max(video.size[0] for video in self.videos)
         with self.say.work("search", len(places) * len(times)):
-            found = compare(evidence, values, times, self.moving, starts, self.say.tick)
+            found = compare(evidence, values, times, self.moving, self.say.tick, starts)
         costs, best = torch.stack([cost_of(block, scale) for block in found]).min(0)
         if known is not None:
             places[:, self.sought[FILM_START]] = torch.tensor([known.share(start) for start in starts]).double()[best]
@@ -296,15 +249,15 @@ class Problem:
     def best_of(self, places: Sequence[Sequence[float]]) -> list[list[float]]:
         """Solve from several starts for a short while, and return the best end, and another with nearly its cost."""
         times = self._until(FOLLOWED)
-        ended, costs = self._brief(places, self.evidence(), times)
-        for place, cost in zip(ended, costs, strict=True):
+        ended = self._brief(places, self.evidence(), times)
+        for cost, place in ended:
             self.say(f"start to {times[-1]:.3g} s: cost {cost:.3g}, {self._shown(place)}")
-        return ended[: 1 + sum(cost < 2 * costs[0] for cost in costs[1:2])]
+        return [place for cost, place in ended[:2] if cost <= 2 * ended[0][0]]
 
     def _brief(
-        self, places: Sequence[Sequence[float]], evidence: Sequence[Evidence] | None, times: Sequence[float]
-    ) -> tuple[list[list[float]], list[float]]:
-        """Short solves from some places: their ends, apart from each other and the best first, and their costs.
+        self, places: Sequence[Sequence[float]], evidence: Sequence[Tracks] | None, times: Sequence[float]
+    ) -> list[tuple[float, list[float]]]:
+        """Short solves from some places: costs and ends, apart from each other and the best first.
 
         Without evidence each compares the points of its own first frame, as those of one place speak for that place.
         """
@@ -319,31 +272,29 @@ class Problem:
         if not found:
             raise DivergedError("Every simulation of a start diverged: narrow the ranges of `unknowns`.")
         scale = min(own.scale for own in found)
-        costs = [float(cost_of(own.block, scale)[0]) for own in found]
-        ends: list[list[float]] = []
-        kept: list[float] = []
-        for cost, end in sorted(zip(costs, (own.place.tolist() for own in found), strict=True)):
-            if all(apart_by(self.plan.unknowns, end, other) > SAME for other in ends):
-                ends, kept = [*ends, end], [*kept, cost]
-        return ends, kept
+        ends: list[tuple[float, list[float]]] = []
+        for cost, end in sorted((float(cost_of(own.block, scale)[0]), own.place.tolist()) for own in found):
+            if all(apart_by(self.plan.unknowns, end, other) > SAME for _, other in ends):
+                ends.append((cost, end))
+        return ends
 
     def others(self, place: Sequence[float], rivals: Sequence[Sequence[float]]) -> list[dict[str, float]]:
         """Values of other ends, of other starts and the mirrored wind, that cost about as little over all frames."""
-        model, unknowns = self.simulation.model, self.plan.unknowns
-        tried = [*map(list, rivals), *mirrored_place(model, unknowns, place)]
-        if not tried:
+        unknowns, other = self.plan.unknowns, mirrored_place(self.simulation.model, self.plan.unknowns, place)
+        tried, near = [list(place), *map(list, rivals), *other], []
+        if len(tried) == 1:
             return []
         try:
-            evidence = None if self.moving else self.trusted(self.evidence(), place)
-            ended, costs = self._brief([list(place), *tried], evidence, self.fitted)
+            ended = self._brief(tried, None if self.moving else self.trusted(self.evidence(), place), self.fitted)
         except DivergedError:
             return []
-        near = []
-        for end, cost in zip(ended, costs, strict=True):
+        for cost, end in ended:
             self.say(f"rival: cost {cost:.5g}, {self._shown(end)}")
-            most = MIRRORED if is_mirrored(model, self.values(place), self.values(end)) else RIVAL
-            if cost < most * costs[0] and apart_by(unknowns, end, place) > 2 * SAME:
-                near.append(self.values(end))
+            values = self.values(end)
+            aside = [turn(values["wind.azimuth"] - self.values(mirror)["wind.azimuth"]) for mirror in other]
+            most = MIRRORED if any(abs(angle) < MIRROR for angle in aside) else RIVAL
+            if cost < most * ended[0][0] and apart_by(unknowns, end, place) > 2 * SAME:
+                near.append(values)
         return near
 
     def expected(self) -> str:
@@ -362,82 +313,82 @@ class Problem:
             told += f"; less than half of it on a coarser grid (`known: {{solver.dx: {coarser:.2g}}}`)"
         return told
 
-    def run(self, course: Course, keep: Callable[[Course], None], films: Path | None = None) -> Fit:
-        """Do the steps that are missing, call ``keep`` after each, and return the result.
+    def run(self, course: dict[str, Any], keep: Callable[[], None], folder: Path | None = None) -> Fit:
+        """Do the steps that ``course`` does not have, put them into it, call ``keep`` after each; return the result.
 
-        Films beside the fit are written into the folder ``films``.
+        Of the places in it, shares of the ranges, ``starts`` are those of the search, ``first`` looks like the first
+        frame, or is empty if that shows the scene at rest, and ``rivals`` are ends of other starts. ``places`` has the
+        end of the best start and those of the solves in ``history``, one for each of :data:`STEPS` and more for the
+        last. Films beside the fit are written into a folder.
         """
-        clock = time.monotonic() - course.seconds
+        clock = time.monotonic() - course.setdefault("seconds", 0.0)
 
-        def kept() -> None:
-            course.seconds = time.monotonic() - clock
-            keep(course)
+        def kept(**found: Any) -> None:
+            course.update(found, seconds=time.monotonic() - clock)
+            keep()
 
-        self.begin_at(course.first)
-        if course.step < 0:
+        self.begin_at(course.get("first", []))
+        if "places" not in course:
             kept()
-            for note in self.notes():
+            for note in (*self.notes(), self.expected()):
                 self.say(note)
-            self.say(self.expected())
-            if not course.starts:
-                course.starts, course.first = self.search(), list(self.first)
-                kept()
-            course.place, *course.rivals = self.best_of(course.starts)
-            self.say(f"search: {self._shown(course.place)}")
-            at = torch.tensor(course.place, dtype=torch.float64)
-            matrix = linearised(self.residuals(self.evidence(), self.fitted), at).matrix
+            if "starts" not in course:
+                kept(starts=self.search(), first=self.first)
+            place, *rivals = self.best_of(course["starts"])
+            self.say(f"search: {self._shown(place)}")
+            at = torch.tensor(place, dtype=torch.float64)
+            matrix, _ = linearised(self.residuals(self.evidence(), self.fitted), at)
             check_apart(matrix, self.plan.unknowns, at, self.plan.limit)
-            course.step = 0
-            kept()
-        result = self.result(course, self._stepped(course, kept), films)
+            kept(places=[place], rivals=rivals, history=[])
+        result = self.result(course, self._stepped(course["places"], course["history"], kept), folder)
         return replace(result, seconds=time.monotonic() - clock)
 
-    def _stepped(self, course: Course, kept: Callable[[], None]) -> list[Evidence]:
-        for number in range(course.step, len(STEPS)):
-            times, last = self._until(STEPS[number]), number == len(STEPS) - 1
-            course.matched = course.matched or list(course.place)
-            evidence = self.trusted(self.evidence(course.matched), course.matched)
-            left = self.plan.iterations - course.tried // TRIES
-            if course.ended or left <= 0:  # it is continued after its end
+    def _stepped(
+        self, places: list[list[float]], history: list[dict[str, Any]], kept: Callable[[], None]
+    ) -> list[Tracks]:
+        last = len(STEPS) - 1
+        while True:
+            number = min(len(history), last)
+            times, matched = self._until(STEPS[number]), places[number]
+            evidence = self.trusted(self.evidence(matched), matched)
+            left = self.plan.iterations - sum(row["steps"] for row in history[last:]) // TRIES
+            if left <= 0 or (history[last:] and history[-1]["ended"]):  # it is continued after its end
                 return evidence
-            found = self.solved(course.place, evidence, times, left, last)
-            course.place = found.place.tolist()
+            found = self.solved(places[-1], evidence, times, left, number == last)
+            places.append(found.place.tolist())
             row = {"until": times[-1], "steps": found.steps, "cost": found.cost, "ended": found.ended}
-            course.history.append(row | {"pixels": found.scale} | self.values(course.place))
-            self.say(f"matches to {times[-1]:.3g} s, {found.steps} steps: {self._shown(course.place)}")
-            if last:
-                course.ended, course.tried = found.ended, course.tried + found.steps
-            else:
-                course.step, course.matched = number + 1, []
+            history.append(row | {"pixels": found.scale} | self.values(places[-1]))
+            self.say(f"matches to {times[-1]:.3g} s, {found.steps} steps: {self._shown(places[-1])}")
             kept()
-        return evidence
+            if number == last:
+                return evidence
 
-    def result(self, course: Course, evidence: Sequence[Evidence], films: Path | None) -> Fit:
-        place, values = torch.tensor(course.place, dtype=torch.float64), self.values(course.place)
+    def result(self, course: Mapping[str, Any], evidence: Sequence[Tracks], folder: Path | None) -> Fit:
+        at = course["places"][-1]
+        place, held = torch.tensor(at, dtype=torch.float64), [split(own)[1] for own in self.tracks]
+        values = self.values(at)
         normal = linearised(self.residuals(evidence, self.fitted), place)
-        pairs = zip(self.videos, self.tracks, strict=True)
-        held = [Evidence(self.simulation, video, split(own)[1]) for video, own in pairs]
         return Fit(
             self.plan.unknowns,
-            tuple(course.place),
-            normal.covariance() + self.grid_covariance(place, evidence),
-            course.history,
-            course.seconds,
-            "" if course.ended else UNSETTLED,
+            tuple(at),
+            covariance(*normal) + self.grid_covariance(place, evidence),
+            course["history"],
+            course["seconds"],
+            "" if course["history"][-1]["ended"] else UNSETTLED,
             tuple(self.notes()),
-            write_films(films, held, values, self.times, len(self.fitted)) if films else {},
+            write_films(folder, held, values, self.times, len(self.fitted)) if folder else {},
             explained(held, values, self.fitted),
             consequences(self.plan.assumed, values, self.simulation),
             self.told,
-            self.others(course.place, course.rivals),
+            self.others(at, course["rivals"]),
         )
 
-    def grid_covariance(self, place: Tensor, evidence: Sequence[Evidence]) -> Tensor:
+    def grid_covariance(self, place: Tensor, evidence: Sequence[Tracks]) -> Tensor:
         """The covariance that the grid adds at a place, (U, U): how far the minimum of another grid is."""
         found = torch.zeros(len(place), len(place), dtype=torch.float64)
         for other in self.grids:
             with suppress(DivergedError):
-                own = [part.on(other) for part in evidence]
+                own = [replace(part, simulation=other) for part in evidence]
                 end = self.solved(place.tolist(), own, self.fitted, REFINED, True).place
                 found += torch.outer(end - place, end - place)
         return found
@@ -453,8 +404,8 @@ class Problem:
                 "give a film that begins at rest."
             )
         found += self.doubts
-        pairs = [] if self.doubts or self.begins is not None else zip(self.videos, self.tracks, strict=True)
-        still = min((still_until(self.simulation, video, own) for video, own in pairs), default=0.0)
+        asked = [] if self.doubts or self.begins is not None else self.tracks
+        still = min((own.still_until() for own in asked), default=0.0)
         if still >= LONG_STILL:
             found.append(
                 f"Nothing moves in the first {still:.2g} s of the film, but the simulation starts at once: add "
@@ -480,32 +431,32 @@ def run_fit(
 
     ``started`` is called when it can be continued. An earlier fit is not moved aside with files that are ``in_use``.
     """
-    begin, folder, parser = time.monotonic(), Path(output), Simulation.parser()
-    settings = parse_base(plan, parser)
-    problem = _ready(plan, parser, settings, device, progress)
-    described = _described(plan, problem.simulation)
+    begin, folder = time.monotonic(), Path(output)
+    problem, parser, settings = _ready(plan, device, progress)
+    own = {name: value for name, value in vars(plan).items() if name not in ("base", "unknowns", "iterations")}
+    own |= {"unknowns": list(map(vars, plan.unknowns)), "scene": problem.simulation.config}
+    described = json.loads(json.dumps(own))  # what must be the same in a fit that is continued, as it is read
     remedy = "choose another with --output"
     if resume and not (folder / PROGRESS).exists():
         raise ValueError(f"There is nothing to resume in {folder}: it has no {PROGRESS}; leave out --resume.")
     needed = [*in_use, *(Path(path) for path in (*plan.base, *plan.videos, settings.scene.ply) if path)]
     lock = hold_folder(folder, remedy) if resume else claim_folder(folder, OURS, remedy, needed)
     try:
-        course = _read_course(folder, described) if resume else Course()
+        course = _read_course(folder, described) if resume else {}
 
-        def keep(course: Course) -> None:
-            write_json(folder / PROGRESS, {"plan": described, "course": vars(course)})
+        def keep() -> None:
+            write_json(folder / PROGRESS, {"format": FORMAT, "plan": described, "course": course})
             started()
 
-        problem.look(folder)
-        course.seconds += time.monotonic() - begin
+        write_before(folder, problem.tracks)
+        course["seconds"] = course.get("seconds", 0.0) + time.monotonic() - begin
         try:
-            result = problem.run(course, keep, folder / PICTURES)
+            result = problem.run(course, keep, folder)
         except ValueError:
-            if course.step < 0:  # it was refused before the first step: only pictures stay
+            if "places" not in course:  # it was refused before the first step: only pictures stay
                 (folder / PROGRESS).unlink(missing_ok=True)
             raise
         write_results(folder, result, parser, settings, problem.simulation)
-        write_page(folder, result)
         return result
     finally:
         lock.release()
@@ -517,15 +468,18 @@ def run_fit(
 
 def check_fit(plan: Plan, output: str | os.PathLike[str], *, device: str = "auto", progress: bool = True) -> list[Path]:
     """Read all that a fit needs, say what speaks against it and what it takes, and write the pictures before it."""
-    parser = Simulation.parser()
-    problem = _ready(plan, parser, parse_base(plan, parser), device, progress)
+    problem, *_ = _ready(plan, device, progress)
     for note in (*problem.notes(), problem.expected()):
         problem.say(note)
-    return problem.look(Path(output))
+    return write_before(Path(output), problem.tracks)
 
 
-def _ready(plan: Plan, parser: Any, settings: Any, device: str, progress: bool) -> Problem:
+def _ready(plan: Plan, device: str, progress: bool) -> tuple[Problem, ArgumentParser, Namespace]:
     opencv()  # before anything that takes time
+    parser = Simulation.parser()
+    files = [word for name in plan.base for word in ("--config", name)]
+    settings = parser.parse_args([*files, *(option(name, value) for name, value in plan.known.items())])
+    check_settings(Simulation, settings)
     settings.device = device
     own = settings.clone()
     own.camera = own.cameras = None  # the videos have their own
@@ -537,7 +491,8 @@ def _ready(plan: Plan, parser: Any, settings: Any, device: str, progress: bool) 
         videos, told, doubts = prepared(simulation, videos, plan.hand_held, plan.also_moves, say.tick)
     for line in told:
         say(line)
-    return Problem(simulation, videos, plan, say, _other_grids(simulation, say), told, [*looked, *doubts])
+    grids = _other_grids(simulation, say)
+    return Problem(simulation, videos, plan, say, grids, told, [*looked, *doubts]), parser, settings
 
 
 def _other_grids(simulation: Simulation, say: Say) -> list[Simulation]:
@@ -576,28 +531,17 @@ def fit(
         progress: Print a line for each step, and a bar.
         settings: Further fields of :class:`~gaussian_swaying.inverse.plan.Plan`, such as ``known`` and ``until``.
     """
-    several = ([given] if isinstance(given, str | os.PathLike) else given for given in (base, videos))
-    own, films = ([os.fspath(name) for name in names] for names in several)
-    plan = Plan(own, films, [read_unknown(name, entry) for name, entry in unknowns.items()], **settings)
+    plan = make_plan({"base": base, "videos": videos, "unknowns": unknowns, **settings}, "a fit")
     return run_fit(plan, output, resume=resume, device=device, progress=progress)
 
 
-def _described(plan: Plan, simulation: Simulation) -> dict[str, Any]:
-    """All settings that must be the same in a fit and the one that it continues, as they will be read."""
-    own = {name: value for name, value in vars(plan).items() if name not in ("base", "unknowns", "iterations")}
-    sought = {u.name: [u.low, u.high, u.scale, u.start] for u in plan.unknowns}
-    return json.loads(json.dumps({**own, "unknowns": sought, "scene": simulation.config}))
-
-
-def _read_course(folder: Path, described: Mapping[str, Any]) -> Course:
+def _read_course(folder: Path, described: Mapping[str, Any]) -> dict[str, Any]:
     kept = read_json(folder / PROGRESS, "progress of the fit")
-    if not isinstance(kept, dict) or set(kept) != {"plan", "course"} or set(kept["course"]) != set(vars(Course())):
+    if not isinstance(kept, dict) or kept.get("format") != FORMAT:
         raise ValueError(
             f"{folder / PROGRESS} is of another version of the program: leave out --resume to begin again."
         )
-    if kept["plan"] != described:
-        changed = [name for name in described if kept["plan"].get(name) != described[name]]
-        raise ValueError(
-            f"The fit in {folder} has another `{changed[0] if changed else 'plan'}`: leave out --resume to begin again."
-        )
-    return Course(**kept["course"])
+    for name, value in described.items():
+        if kept["plan"].get(name) != value:
+            raise ValueError(f"The fit in {folder} has another `{name}`: leave out --resume to begin again.")
+    return dict(kept["course"])

@@ -41,9 +41,9 @@ from gaussian_swaying.inverse.registration import (
     shown_in,
     transforms,
 )
-from gaussian_swaying.inverse.report import Fit, side_by_side, titled
+from gaussian_swaying.inverse.report import Fit, side_by_side
 from gaussian_swaying.inverse.tracks import corners, follow, opencv
-from gaussian_swaying.inverse.videos import Footage, check_wide, frames_of, next_of, read_videos, scaled
+from gaussian_swaying.inverse.videos import Footage, check_wide, frames_of, read_videos, scaled
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.suggestion.starter import keep_aside, write_starter
@@ -72,41 +72,42 @@ SHORTER, LONGER = 0.25, 4.0  # range of lengths, per the guess, if the weight is
 Length = tuple[str, float] | Literal["gravity"] | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Film:
     """A film whose frames are read in another size, by which it is ``full`` times as large.
 
-    ``seconds`` is infinite, and ``focal`` (on 35 mm film [mm]) None, if the file does not say it.
+    ``seconds`` is infinite, and ``focal`` (on 35 mm film [mm]) None, if the file does not say it. The ``first`` frame
+    is uint8, (H, W, 3).
     """
 
     path: Path
-    width: int
-    height: int
+    first: Tensor
     full: float
     fps: float
     seconds: float
-    focal: float | None = None
+    focal: float | None
 
-    def first_frame(self) -> Tensor:
-        """The first frame, dtype uint8, shape (H, W, 3)."""
-        with closing(frames_of(self.path, outputs=scaled(self.width, self.height))) as frames:
-            head, frame = next_of(frames, self.path), next_of(frames, self.path)
-            return torch.frombuffer(bytearray(frame), dtype=torch.uint8).reshape(*head["size"][::-1], 3)
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [pixels]."""
+        return self.first.shape[1], self.first.shape[0]
 
 
 def open_film(path: str | Path, side: float | None = None) -> Film:
-    """Read the head of a film whose frames are to have at most this longer side [pixels]."""
+    """Read the head and the first frame of a film, whose frames are to have at most this longer side [pixels]."""
     file = check_regular(Path(path), "the film")
     with closing(frames_of(file)) as frames:
-        head = next_of(frames, file)
-        if head is None or next_of(frames, file) is None:
+        head = next(frames)
+        if next(frames, None) is None:
             raise ValueError(f"The film {file} has no frames: convert it to mp4.")
     width, height = head["size"]
     factor = max(1.0, max(width, height) / (side or SIDE))
     if not head["fps"] > 0:
         raise ValueError(f"The film {file} does not say its frame rate: convert it to mp4.")
     size = check_wide(file, round(width / factor), round(height / factor))
-    return Film(file, *size, factor, head["fps"], float(head["duration"]) or math.inf, _focal(file))
+    with closing(frames_of(file, outputs=scaled(*size))) as frames:
+        _, first = next(frames), torch.from_numpy(next(frames))
+    return Film(file, first, factor, head["fps"], float(head["duration"]) or math.inf, _focal(file))
 
 
 def _focal(path: Path) -> float | None:
@@ -170,18 +171,16 @@ class Points:
 def begins_to_move(film: Film, picture: RenderOutput, camera: Camera) -> float | None:
     """Time of the first frame in which the object, not only the camera, has moved [s]; None if there is none."""
     cv2: Any = opencv()
-    factor = max(1.0, max(film.width, film.height) / SMALL)
-    size = round(film.width / factor), round(film.height / factor)
-    with closing(frames_of(film.path, outputs=scaled(*size), grey=True)) as frames:
-        shape = next_of(frames, film.path)["size"][::-1]
-        first = np.frombuffer(next_of(frames, film.path), dtype=np.uint8).reshape(shape)
-        cover = (
-            cv2.resize(picture.alpha[..., 0].detach().cpu().numpy(), shape[::-1], interpolation=cv2.INTER_AREA) > 0.3
-        )
+    factor = max(1.0, max(film.size) / SMALL)
+    small = scaled(*(round(side / factor) for side in film.size))
+    with closing(frames_of(film.path, outputs=small, grey=True)) as frames:
+        _, first = next(frames), next(frames)
+        shape = first.shape[::-1]
+        alpha = picture.alpha[..., 0].detach().cpu().numpy()
+        cover = cv2.resize(alpha, shape, interpolation=cv2.INTER_AREA) > 0.3
         inside = cover if cover.any() else ~cover
-        points, number, in_a_row = Points(first, picture, camera), 1, 0
-        while (frame := next_of(frames, film.path)) is not None:
-            grey = np.frombuffer(frame, dtype=np.uint8).reshape(shape)
+        points, in_a_row = Points(first, picture, camera), 0
+        for number, grey in enumerate(frames, 1):
             moved = _differs(first, grey, inside)
             if moved:
                 (_, place), (_, seen) = follow(np.stack([first, grey]), points.start)
@@ -190,11 +189,10 @@ def begins_to_move(film: Film, picture: RenderOutput, camera: Camera) -> float |
                     moved = (far > STRAY).sum() >= max(LEAST_SHAKEN, MOVED_SHARE * np.isfinite(far).sum())
                 else:
                     how = {"flags": cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
-                    moved = _differs(first, cv2.warpAffine(grey, points.shake(place, seen), shape[::-1], **how), inside)
+                    moved = _differs(first, cv2.warpAffine(grey, points.shake(place, seen), shape, **how), inside)
             in_a_row = in_a_row + 1 if moved else 0
             if in_a_row == (IN_A_ROW if points.full else 1):
                 return (number + 1 - in_a_row) / film.fps
-            number += 1
     return None
 
 
@@ -262,10 +260,9 @@ def moving_points(video: Footage, picture: RenderOutput) -> tuple[Tensor, Tensor
 
 
 class Seen(NamedTuple):
-    """The first frame, the splat, the camera with its residual [pixels], and the splat's picture from there."""
+    """A film, the splat, the camera of the first frame with its residual [pixels], and the splat's picture there."""
 
     film: Film
-    frame: Tensor
     cloud: GaussianCloud
     camera: Camera
     picture: RenderOutput
@@ -325,7 +322,7 @@ def prepare(
     seen, told = registered(film, splat, axis, focal)
     say(told)
     folder.mkdir(parents=True, exist_ok=True)
-    iio.imwrite(folder / PICTURE, titled(side_by_side(seen.frame, seen.picture)))
+    iio.imwrite(folder / PICTURE, side_by_side(seen.film.first, seen.picture))
     moves = begins_to_move(seen.film, seen.picture, seen.camera)
     if moves is None:
         raise ValueError(
@@ -333,7 +330,7 @@ def prepare(
             "in which the wind moves it."
         )
     at_once = moves < 1.5 / seen.film.fps
-    if at_once and seen.residual > ROUGH * math.hypot(seen.film.width, seen.film.height):
+    if at_once and seen.residual > ROUGH * math.hypot(*seen.film.size):
         raise ValueError(
             f"The film {film} begins in motion, and its camera was found to {seen.residual:.1f} pixels only: "
             "cut it so that it begins with the object at rest, or write a fit file with a camera that you know."
@@ -359,7 +356,7 @@ def prepare(
     write_starter(preview, folder / LOOK, 250)
     iio.imwrite(folder / LOOK / "preview.png", preview.picture())
     around = seen.picture.alpha[..., 0].cpu() < 0.05  # the colour that most of it has is the background
-    pixels = seen.frame[around] if bool(around.any()) else seen.frame.flatten(0, 1)
+    pixels = seen.film.first[around] if bool(around.any()) else seen.film.first.flatten(0, 1)
     colour = [round(value / 255, 3) for value in pixels.median(0).values.tolist()]
     text = plan_text(preview, colour, None if at_once else moves - begin, length, folder)
     keep_aside(folder / PLAN, text)
@@ -379,13 +376,12 @@ def registered(
     film: str | os.PathLike[str], splat: str | os.PathLike[str], up: Sequence[float] | None, focal: float | None
 ) -> tuple[Seen, str]:
     """The first frame of a film with its camera, and a sentence on that."""
-    head = open_film(os.fspath(film))
-    frame, cloud = head.first_frame(), read_gaussians(splat, 0)
+    head, cloud = open_film(os.fspath(film)), read_gaussians(splat, 0)
     known, found = focal or head.focal, None
-    fov = None if known is None else view_of_focal(known, head.width, head.height)
+    fov = None if known is None else view_of_focal(known, *head.size)
     with suppress(ValueError):
-        found, picture = register(frame, cloud, up, fov)
-    if found is None or shown_in(picture, frame)[0] < FOUND:
+        found, picture = register(head.first, cloud, up, fov)
+    if found is None or shown_in(picture, head.first)[0] < FOUND:
         raise ValueError(
             f"The splat was not found in the first frame of {film}. It has to show the object at rest, large "
             "and with texture, from a side that was captured; `--up` and `--focal` help."
@@ -395,7 +391,7 @@ def registered(
         f"camera: {found.agreeing} of {found.matches} points agree, {found.residual:.1f} pixels off; focal length "
         f"{source} ({fov_of(found.camera):.0f} degrees from top to bottom)"
     )
-    return Seen(head, frame, cloud, found.camera, picture, found.residual), told
+    return Seen(head, cloud, found.camera, picture, found.residual), told
 
 
 def _shown(seen: Seen, video: Footage, preview: Suggestion, wanted: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -132,31 +132,29 @@ def _beside(place: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cat([place + torch.diag(end - place) for end in (up, down)]), up - down
 
 
-@dataclass(frozen=True, eq=False)
-class Normal:
-    """Normal equations at a point: J^T W J (U, U), and the parts J^T W r of both kinds of clusters (C, U)."""
+def covariance(matrix: Tensor, scores: Sequence[Tensor]) -> Tensor:
+    r"""Covariance of the unknowns in shares of their ranges, shape (U, U), from what :func:`linearised` returns.
 
-    matrix: Tensor
-    scores: tuple[Tensor, Tensor]
-
-    def covariance(self) -> Tensor:
-        r"""Covariance of the unknowns in shares of their ranges, shape (U, U).
-
-        :math:`A^{-1} \bigl(\sum \tfrac{C}{C - 1} \sum_c g_c g_c^T\bigr) A^{-1} + A^{-1}`, where the gradients are
-        summed over clusters of correlated residuals: the sandwich of White (1980) and Liang & Zeger (1986).
-        The usual :math:`s^2 A^{-1}` takes all residuals for independent, and is far too small alone. It is added, as
-        the sandwich of few clusters, or of residuals below the lower bound of the standard deviation, may be near zero.
-        """
-        inverse = torch.linalg.pinv(self.matrix, hermitian=True)
-        middle = torch.zeros_like(self.matrix)
-        for scores in self.scores:
-            clusters = int((scores.abs().sum(-1) > 0).sum())
-            middle = middle + clusters / max(clusters - 1, 1) * scores.mT @ scores
-        return inverse @ middle @ inverse + inverse
+    :math:`A^{-1} \bigl(\sum \tfrac{C}{C - 1} \sum_c g_c g_c^T\bigr) A^{-1} + A^{-1}`, where the gradients are summed
+    over clusters of correlated residuals: the sandwich of White (1980) and Liang & Zeger (1986). The usual
+    :math:`s^2 A^{-1}` takes all residuals for independent, and is far too small alone. It is added, as the sandwich of
+    few clusters, or of residuals below the lower bound of the standard deviation, may be near zero.
+    """
+    inverse = torch.linalg.pinv(matrix, hermitian=True)
+    middle = torch.zeros_like(matrix)
+    for own in scores:
+        clusters = int((own.abs().sum(-1) > 0).sum())
+        middle = middle + clusters / max(clusters - 1, 1) * own.mT @ own
+    return inverse @ middle @ inverse + inverse
 
 
-def linearised(residuals: Residuals, place: Tensor, scale: Callable[[Block], float] = scale_of) -> Normal:
-    """Normal equations at a place, from central differences of one batch."""
+def linearised(
+    residuals: Residuals, place: Tensor, scale: Callable[[Block], float] = scale_of
+) -> tuple[Tensor, list[Tensor]]:
+    """Normal equations at a place, from central differences of one batch.
+
+    J^T W J, shape (U, U), and the parts of J^T W r of both kinds of clusters, each (C, U).
+    """
     both, widths = _beside(place)
     block, unknowns = residuals(torch.cat([place[None], both])), len(place)
     sigma = scale(block)
@@ -171,4 +169,4 @@ def linearised(residuals: Residuals, place: Tensor, scale: Callable[[Block], flo
     flat = (change * weight.sqrt()).flatten(1)
     moment = torch.zeros_like(block.cluster) if block.moment is None else block.moment
     scores = [own.new_zeros(1 + int(one.max()), unknowns).index_add(0, one, own) for one in (block.cluster, moment)]
-    return Normal(flat @ flat.mT, (scores[0], scores[1]))
+    return flat @ flat.mT, scores

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,20 +19,15 @@ from gaussian_swaying._fixed import changed
 from gaussian_swaying._live import Live
 from gaussian_swaying._yaml_limits import read_fields
 from gaussian_swaying.config.gone import refuse_gone
-from gaussian_swaying.config.parser import check_settings, import_forces, option
+from gaussian_swaying.config.parser import import_forces
 from gaussian_swaying.simulation.model import Model, find, names
-from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.wind.field import WindField
-
-if TYPE_CHECKING:
-    from jsonargparse import ArgumentParser, Namespace
-
 
 Values = Mapping[str, float]  # values of the unknowns, by name
 SCALES = ("log", "linear")
 SCALE, FILM_START = "scene.metres_per_unit", "film.start"  # start of the motion [s]; below 0, the wind has blown before
 FLAT = 0.8  # mean square of the area that faces one way, from which the wind may be mirrored
-TURN, MIRROR = 5.0, 20.0  # least angle between wind and mirror image, and largest to another end [degrees]
+TURN = 5.0  # least angle between wind and mirror image [degrees]
 LARGE = 0.25  # share of the largest part of a direction below which an unknown is not named
 OF_FILM = {FILM_START: Live("s"), SCALE: Live("m", scale="log")}  # unknowns that are no numbers of the simulation
 LISTS = ("base", "videos", "cameras", "assumed", "also_moves")
@@ -117,17 +112,6 @@ def model_of(model: Model, values: Values) -> Model:
     """The model of a variant, at another scale if its values say so."""
     found = model.at(of_simulation(values))
     return at_scale(found, values[SCALE]) if SCALE in values else found
-
-
-def check_unknowns(simulation: Simulation, unknowns: Sequence[Unknown]) -> None:
-    """Raise ValueError if a simulation has no such parameter as an unknown; the message names it and the remedy."""
-    names = [unknown.name for unknown in unknowns]
-    if not names:
-        raise ValueError("Expected `unknowns` to have at least one entry, such as wind.speed: add it.")
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"`{name}` is in `unknowns` twice: remove one.")
-    model_of(simulation.model, {unknown.name: unknown.value(0.5) for unknown in unknowns})
 
 
 def at_scale(model: Model, metres_per_unit: float) -> Model:
@@ -230,12 +214,6 @@ def mirrored(model: Model, azimuth: float) -> float | None:
     return other if abs(turn(other - azimuth)) >= TURN else None
 
 
-def is_mirrored(model: Model, values: Values, end: Values) -> bool:
-    """True if the wind at the end of another start is about the mirror image of that of some values."""
-    other = mirrored(model, values["wind.azimuth"]) if "wind.azimuth" in values else None
-    return other is not None and abs(turn(end["wind.azimuth"] - other)) < MIRROR
-
-
 @dataclass(frozen=True)
 class Plan:
     """The settings of a fit, which docs/fit.md describes."""
@@ -265,34 +243,40 @@ class Plan:
 
 def read_plan(path: str | os.PathLike[str], find: Callable[[str], str] = str) -> Plan:
     """Read a ``fit.yaml``, see docs/fit.md; ``find`` gives the file of a name in ``base`` that is not beside it."""
-    file, names = Path(path), [entry.name for entry in fields(Plan)]
-    read = read_fields(file, "the fit file", names, partial(refuse_gone, within="fit"))
-    given: dict[str, Any] = {
-        name: [value] if name in LISTS and isinstance(value, str) else value
-        for name, value in read.items()
+    names, gone = [entry.name for entry in fields(Plan)], partial(refuse_gone, within="fit")
+    return make_plan(read_fields(path, "the fit file", names, gone), str(path), find, Path(path).parent)
+
+
+def make_plan(given: Mapping[str, Any], where: str, find: Callable[[str], str] = str, folder: Path = Path()) -> Plan:
+    """A plan from its fields, whose unknowns are as for :func:`read_unknown`, of a file or a call (``where``).
+
+    Names of files count from a folder; ``find`` gives the file of a name in ``base`` that is not there.
+    """
+    own: dict[str, Any] = {
+        name: [str(value)] if name in LISTS and isinstance(value, str | os.PathLike) else value
+        for name, value in given.items()
         if value is not None
     }
-    sought, known = given.pop("unknowns", None), given.pop("known", {})
-    check_arguments(Plan.__init__, given | {"known": known}, str(file))
-    if not isinstance(sought, dict) or not sought:
+    sought, known = own.pop("unknowns", None), own.pop("known", {})
+    check_arguments(Plan.__init__, own | {"known": known}, where)
+    if not isinstance(sought, Mapping) or not sought:
         raise ValueError(
-            f"Expected `unknowns` in {file} to have entries such as wind.speed: {{range: [1, 10]}}, but got "
+            f"Expected `unknowns` in {where} to have entries such as wind.speed: {{range: [1, 10]}}, but got "
             f"{sought!r:.60}."
         )
-    for name in ("base", "videos"):
-        if not given.get(name):
-            raise ValueError(f"Expected `{name}` in {file} to be a name or a list of names: add it.")
 
     def beside(value: Any) -> Any:
-        there = isinstance(value, str) and (file.parent / value).exists()
-        return str(file.parent / value) if there else value
+        there = isinstance(value, str) and (folder / value).exists()
+        return str(folder / value) if there else value
 
-    base = [beside(name) if beside(name) != name else find(name) for name in given.pop("base")]
+    for name in ("base", "videos"):
+        if not own.get(name):
+            raise ValueError(f"Expected `{name}` in {where} to be a name or a list of names: add it.")
+    base = [beside(name) if (folder / name).exists() else find(name) for name in own.pop("base")]
     import_forces(base)
-    videos = given.pop("videos")
-    videos = [beside(name) if Path(beside(name)).exists() else str(file.parent / name) for name in videos]
+    videos = [str(folder / name) for name in own.pop("videos")]
     unknowns = [read_unknown(name, entry) for name, entry in sought.items()]
-    return Plan(base, videos, unknowns, {name: beside(value) for name, value in known.items()}, **given)
+    return Plan(base, videos, unknowns, {name: beside(value) for name, value in known.items()}, **own)
 
 
 def read_unknown(name: str, given: Any) -> Unknown:
@@ -302,25 +286,15 @@ def read_unknown(name: str, given: Any) -> Unknown:
         >>> read_unknown("material.E", {"range": [1e3, 1e5]}).scale
         'log'
     """
-    where = f"unknowns.{name}"
     further = dict(given) if isinstance(given, Mapping) else {"range": given}
-    ends, start = further.get("range"), further.get("start")
-    if not isinstance(ends, list | tuple) or len(ends) != 2 or not all(map(is_number, ends)):
-        raise ValueError(f"Expected `{where}` to be {{range: [low, high]}}, but got {given!r:.60}.")
-    for key in further:
-        if key not in ("range", "scale", "start"):
-            raise ValueError(f"`{where}` has an unknown entry `{key}`: use range, scale and start.")
-    if start is not None and not is_number(start):
-        raise ValueError(f"Expected `{where}.start` to be a number, but got {start!r}.")
-    low, high = map(float, ends)
+    ends, start, scale = (further.pop(key, None) for key in ("range", "start", "scale"))
+    numbers = [*ends, *([] if start is None else [start])] if isinstance(ends, list | tuple) and len(ends) == 2 else []
+    if further or not numbers or not all(map(is_number, numbers)):
+        raise ValueError(
+            f"Expected `unknowns.{name}` to be {{range: [low, high]}}, if needed with scale and start, a number, but "
+            f"got {given!r:.60}."
+        )
+    low, high, *begin = map(float, numbers)
     known = known_unknown(str(name))
-    scale = str(further.get("scale") or ("log" if low > 0 and known and known.scale == "log" else "linear"))
-    return Unknown(str(name), low, high, scale, None if start is None else float(start))
-
-
-def parse_base(plan: Plan, parser: ArgumentParser) -> Namespace:
-    """The settings of the base, with the known options."""
-    files = [word for name in plan.base for word in ("--config", name)]
-    settings = parser.parse_args([*files, *(option(name, value) for name, value in plan.known.items())])
-    check_settings(Simulation, settings)
-    return settings
+    scale = str(scale or ("log" if low > 0 and known and known.scale == "log" else "linear"))
+    return Unknown(str(name), low, high, scale, *begin)

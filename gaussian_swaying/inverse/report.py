@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,11 +16,9 @@ from torch import Tensor
 
 from gaussian_swaying._files import write_json, write_table, write_text
 from gaussian_swaying.config.parser import config_text
-from gaussian_swaying.inverse.evidence import Evidence
 from gaussian_swaying.inverse.plan import SCALE, Unknown, Values, of_simulation, values_at
 from gaussian_swaying.inverse.tracks import Tracks, opencv, picture_of
 from gaussian_swaying.inverse.variants import states_of
-from gaussian_swaying.inverse.videos import Footage
 from gaussian_swaying.recording.video import VideoEncoder
 from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.simulation.model import POLAR, in_settings
@@ -149,40 +146,37 @@ class Fit:
 
 
 def write_films(
-    folder: Path, parts: Sequence[Evidence], values: Values, times: Sequence[float], fitted: int
+    folder: Path, parts: Sequence[Tracks], values: Values, times: Sequence[float], fitted: int
 ) -> dict[str, float]:
-    """Write ``film_CAMERA.mp4``, each whole video beside its simulation at all times, of which so many were fitted.
+    """Write ``pictures/film_CAMERA.mp4``, each video beside its simulation at all times, of which so many were fitted.
 
     Returns:
         For each camera the loss of PSNR of the fitted frames against the first one [dB].
     """
-    simulation, videos = parts[0].simulation, [part.video for part in parts]
-    encoders, errors = list[VideoEncoder](), {video.name: list[float]() for video in videos}
-    folder.mkdir(exist_ok=True)
-    with ExitStack() as left:
-        for video in videos:
-            rate = (len(video.times) - 1) / (video.times[-1] - video.times[0])
-            encoders.append(VideoEncoder(folder / f"film_{video.name}.mp4", rate))
-            left.callback(encoders[-1].abort)
-        for k, (state,) in enumerate(states_of(simulation, [values], times, alike=False)):
-            time, gaussians = times[k], simulation.painter.deformed(state)
-            title = "predicted" if k >= fitted else "fitted"
-            for encoder, video in zip(encoders, videos, strict=True):
-                if (frame := video.frame_at(time)) is not None:
-                    shown = picture_of(simulation, gaussians, video.cameras[frame]).color.clamp(0, 1).float().cpu()
-                    real = video.images[frame].float() / 255
-                    encoder.write(titled([(f"film, {time:.2f} s", real), (title, shown)]))
-                    errors[video.name] += [float((shown - real).square().mean())] if k < fitted else []
-        for encoder in encoders:
-            encoder.finish()
-    shares = {name: max(sum(own) / len(own), 1e-12) / max(own[0], 1e-12) for name, own in errors.items() if own}
-    return {name: 10 * math.log10(share) for name, share in shares.items()}
+    simulation, losses = parts[0].simulation, {}
+    states = [state for (state,) in states_of(simulation, [values], times, alike=False)]
+    (folder / PICTURES).mkdir(exist_ok=True)
+    for video in (part.video for part in parts):
+        rate = (len(video.times) - 1) / (video.times[-1] - video.times[0])
+        encoder, errors = VideoEncoder(folder / PICTURES / f"film_{video.name}.mp4", rate), list[float]()
+        for k, (time, state) in enumerate(zip(times, states, strict=True)):
+            if (frame := video.frame_at(time)) is not None:
+                gaussians, real = simulation.painter.deformed(state), video.images[frame].float() / 255
+                shown = picture_of(simulation, gaussians, video.cameras[frame]).color.clamp(0, 1).float().cpu()
+                encoder.write(
+                    titled([(f"film, {time:.2f} s", real), ("predicted" if k >= fitted else "fitted", shown)])
+                )
+                errors += [float((shown - real).square().mean())] if k < fitted else []
+        encoder.finish()
+        if errors:
+            losses[video.name] = 10 * math.log10(max(sum(errors) / len(errors), 1e-12) / max(errors[0], 1e-12))
+    return losses
 
 
 def write_results(
     folder: Path, result: Fit, parser: ArgumentParser, settings: Namespace, simulation: Simulation
 ) -> None:
-    """Write ``values.csv``, ``result.json`` and ``scene.yaml``."""
+    """Write ``values.csv``, ``result.json``, ``scene.yaml`` and ``page.html``, named after two folders of its path."""
     write_table(folder / "values.csv", result.rows())
     failed, doubtful = result.doubts()
     told = {
@@ -191,13 +185,20 @@ def write_results(
         "verdict": result.verdict,
         "why": [*failed, *doubtful],
         "motion_explained": result.followed,
-        "assumed": result.assumed,
-        "background": result.background,
-        "history": result.history,
-        "seconds": result.seconds,
+        **{name: getattr(result, name) for name in ("assumed", "background", "history", "seconds")},
     }
     write_json(folder / "result.json", told)
     write_text(folder / "scene.yaml", scene_text(result.values, parser, settings, simulation))
+    name, shown = html.escape("/".join(folder.resolve().parts[-2:])), ""
+    for path in [*sorted((folder / PICTURES).glob("*.mp4")), *sorted((folder / BEFORE).glob("*.png"))]:
+        source = f'src="{quote(path.relative_to(folder).as_posix())}"'
+        media = f"<video {source} autoplay loop muted controls></video>" if path.suffix == ".mp4" else f"<img {source}>"
+        shown += f"<h3>{html.escape(path.stem)}</h3>{media}"
+    head = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{name}</title>'
+    style = "<style>video, img { max-width: 100%; max-height: 85vh } pre { white-space: pre-wrap }</style>"
+    slow = "<script>for (const film of document.querySelectorAll('video')) film.playbackRate = 0.5;</script>"
+    text = f"{head}{style}<h1>{name}</h1><pre>{html.escape(result.text())}</pre>{shown}{slow}</html>\n"
+    write_text(folder / "page.html", text)
 
 
 def scene_text(values: Mapping[str, float], parser: ArgumentParser, settings: Namespace, simulation: Simulation) -> str:
@@ -238,59 +239,42 @@ def consequences(assumed: Sequence[str], values: Mapping[str, float], simulation
     return found
 
 
-def write_page(folder: Path, result: Fit) -> None:
-    """Write ``page.html``, named after the last two folders of its path, with the films and pictures of the fit."""
-    name = html.escape("/".join(folder.resolve().parts[-2:]))
-    shown = ""
-    for path in [*sorted((folder / PICTURES).glob("*.mp4")), *sorted((folder / BEFORE).glob("*.png"))]:
-        source = f'src="{quote(path.relative_to(folder).as_posix())}"'
-        media = f"<video {source} autoplay loop muted controls></video>" if path.suffix == ".mp4" else f"<img {source}>"
-        shown += f"<h3>{html.escape(path.stem)}</h3>{media}"
-    head = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{name}</title>'
-    style = "<style>video, img { max-width: 100%; max-height: 85vh } pre { white-space: pre-wrap }</style>"
-    slow = "<script>for (const film of document.querySelectorAll('video')) film.playbackRate = 0.5;</script>"
-    text = f"{head}{style}<h1>{name}</h1><pre>{html.escape(result.text())}</pre>{shown}{slow}</html>\n"
-    write_text(folder / "page.html", text)
-
-
-def write_before(
-    folder: Path, simulation: Simulation, videos: Sequence[Footage], tracks: Sequence[Tracks]
-) -> list[Path]:
-    """Write ``rest_CAMERA.png`` and ``tracks_CAMERA.png``, and return the files."""
+def write_before(folder: Path, tracks: Sequence[Tracks]) -> list[Path]:
+    """Write ``before/rest_CAMERA.png`` and ``before/tracks_CAMERA.png``, and return the files."""
     import imageio.v3 as iio
 
-    folder.mkdir(parents=True, exist_ok=True)
+    (folder / BEFORE).mkdir(parents=True, exist_ok=True)
     found = []
-    for video, own in zip(videos, tracks, strict=True):
-        for name, picture in (("rest", _at_rest(simulation, video)), ("tracks", _tracks_picture(video, own))):
-            found.append(folder / f"{name}_{video.name}.png")
+    for own in tracks:
+        for name, picture in (("rest", _at_rest(own)), ("tracks", _ways(own))):
+            found.append(folder / BEFORE / f"{name}_{own.video.name}.png")
             iio.imwrite(found[-1], picture)
     return found
 
 
-def side_by_side(frame: Tensor, shown: RenderOutput) -> list[tuple[str, Tensor]]:
-    """A frame, dtype uint8, (H, W, 3), the splat half over it, and the splat, each with a title."""
+def side_by_side(frame: Tensor, shown: RenderOutput, *more: tuple[str, Tensor]) -> Any:
+    """A frame, dtype uint8, (H, W, 3), the splat half over it, the splat, and more, as :func:`titled` joins them."""
     real, drawn = frame.float() / 255, shown.color.detach().float().cpu().clamp(0, 1)
     cover = 0.5 * shown.alpha.detach().float().cpu()
-    return [("first frame", real), ("splat half over it", real * (1 - cover) + drawn * cover), ("splat", drawn)]
+    both = real * (1 - cover) + drawn * cover
+    return titled([("first frame", real), ("splat half over it", both), ("splat", drawn), *more])
 
 
-def _at_rest(simulation: Simulation, video: Footage) -> Any:
-    """The first frame, the scene at rest half over it and alone, and what is held there."""
-    painter, rest, parts = simulation.painter, simulation.scene.rest(), classify(simulation)
+def _at_rest(tracks: Tracks) -> Any:
+    simulation, video, rest = tracks.simulation, tracks.video, tracks.simulation.scene.rest()
+    painter, parts = simulation.painter, classify(simulation)
     colours = torch.tensor(STILL_TINT).repeat(len(parts.simulated), 1)
     colours[(parts.simulated | parts.carried).cpu()] = torch.tensor(MOVING)
     colours[parts.pinned.cpu()] = torch.tensor(HELD_TINT)
-    panels = side_by_side(video.images[0], picture_of(simulation, rest, video.cameras[0]))
     roles = painter.draw(rest, colours.to(painter.device), video.cameras[0].to(painter.device))
-    panels.append(("red: held, green: moves, grey: still", roles.color.detach().float().cpu().clamp(0, 1)))
-    return titled(panels)
+    told = ("red: held, green: moves, grey: still", roles.color.detach().float().cpu().clamp(0, 1))
+    return side_by_side(video.images[0], picture_of(simulation, rest, video.cameras[0]), told)
 
 
-def _tracks_picture(video: Footage, tracks: Tracks) -> Any:
+def _ways(tracks: Tracks) -> Any:
     """The first frame, pale, with the ways of the points that are followed."""
     cv2 = opencv()
-    picture = (video.images[0].float() * 0.4 + 255 * 0.6).round().to(torch.uint8).numpy()
+    picture = (tracks.video.images[0].float() * 0.4 + 255 * 0.6).round().to(torch.uint8).numpy()
     for seen, way in zip(tracks.seen.T, tracks.position.transpose(0, 1), strict=True):
         places = way[seen].numpy().astype(np.int32)
         colour = (20, 90, 220) if bool(seen[-1]) else (220, 120, 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ EDGE = 4.0  # least distance from the edges of the picture [pixels]
 ALIKE = 0.7  # least correlation of a point's surroundings in a picture of the splat and in the first frame
 OPAQUE = 0.3  # least opacity of a Gaussian that is followed
 BEHIND = 0.03  # largest depth of a visible Gaussian behind the rendered depth, as a share of the object's size
+PATCHES = 4  # squares along each side of the object: clusters
 THIN = 0.25  # windows over the border are kept if fewer points than this share lie inside
 GREY = torch.tensor([0.299, 0.587, 0.114])
 WINDOW, WIDE = 15, 960  # side of the square that is followed, in pictures of at most this side [pixels]
@@ -63,14 +65,63 @@ def window_of(width: int, height: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Gaussians that were followed in the video of one camera.
+    """Gaussians of a simulation that were followed in the video of one camera.
 
     Their indices among the moving ones (T,), positions [pixels], float64, (F, T, 2), and which are still valid (F, T).
+    Residuals are multiplied by ``trust`` (F, T).
     """
 
+    simulation: Simulation
+    video: Footage
     index: Tensor
     position: Tensor
     seen: Tensor
+    trust: Tensor | None = None
+
+    @cached_property
+    def rest(self) -> Tensor:
+        """Places at rest [scene units], shape (T, 3)."""
+        scene = self.simulation.scene
+        return scene.model.means.detach()[scene.moving[self.index.to(scene.moving.device)]]
+
+    @cached_property
+    def _follow(self) -> Any:
+        scene = self.simulation.scene
+        return scene.follow.some(self.index.to(scene.moving.device)).to(scene.moving.device)
+
+    @cached_property
+    def _cluster(self) -> Tensor:
+        points = self.rest.cpu()
+        if len(points) < 3:
+            return torch.zeros(len(points), dtype=torch.long)
+        centred = (points - points.mean(0)).double()
+        flat = centred @ torch.linalg.svd(centred, full_matrices=False)[2][:2].mT
+        low, high = flat.amin(0), flat.amax(0)
+        cell = ((flat - low) / (high - low).clamp(min=1e-12) * PATCHES).long().clamp(0, PATCHES - 1)
+        return cell[:, 0] * PATCHES + cell[:, 1]
+
+    def shown(self, states: Sequence[State]) -> Tensor:
+        """Places of the Gaussians in some states [scene units], on the CPU, shape (B, T, 3)."""
+        moves = torch.stack([self._follow.motion(state)[0] for state in states]).to(self.rest)
+        return (self.rest + self.simulation.scene.frame.displacement_to_scene(moves)).cpu()
+
+    def pixels(self, shown: Tensor, frame: int) -> Tensor:
+        """Where a frame would have them [pixels], shape (B, T, 2)."""
+        return project(shown.flatten(0, 1), self.video.cameras[frame])[0].unflatten(0, shown.shape[:2])
+
+    def beside(self, shown: Tensor, frame: int) -> tuple[Tensor, Tensor]:
+        """Residuals of some states in a frame [pixels], shape (B, R, 2), and their clusters, shape (R,)."""
+        seen = self.seen[frame]
+        off = self.pixels(shown[:, seen], frame) - self.position[frame, seen]
+        return off if self.trust is None else self.trust[frame, seen, None] * off, self._cluster[seen]
+
+    def still_until(self) -> float:
+        """Time of the last frame before a quarter of them begins to move [s]; 0 if they move in the first frames."""
+        off = self.position - torch.stack([project(self.rest, camera)[0] for camera in self.video.cameras])
+        moved = (off - off[:1]).norm(dim=-1)
+        moved = torch.where(self.seen, moved, torch.nan).nanquantile(0.75, dim=1)
+        begun = (moved > STILL).nonzero()[:, 0]
+        return float(self.video.times[max(int(begun[0]) - 1, 0)]) if len(begun) else 0.0
 
 
 def track(simulation: Simulation, video: Footage, most: int = 400, first: DeformedGaussians | None = None) -> Tracks:
@@ -82,9 +133,9 @@ def track(simulation: Simulation, video: Footage, most: int = 400, first: Deform
     images = video.images if first is None else torch.cat([drawn[None], video.images])
     position, seen = map(torch.from_numpy, follow(images.numpy(), start.numpy()))
     if first is None:
-        return Tracks(chosen, position, seen)
+        return Tracks(simulation, video, chosen, position, seen)
     seen &= alike(images[:2], position[:2]) > ALIKE
-    return Tracks(chosen, position[1:], seen[1:])
+    return Tracks(simulation, video, chosen, position[1:], seen[1:])
 
 
 @torch.no_grad()
@@ -106,17 +157,6 @@ def alike(images: Tensor, position: Tensor) -> Tensor:
         parts = np.array([cv2.getRectSubPix(plane, (side, side), place) for place in own]).reshape(len(own), side**2)
         found.append(torch.from_numpy(parts - parts.mean(1, keepdims=True)))
     return torch.nn.functional.cosine_similarity(found[0], found[1])
-
-
-def still_until(simulation: Simulation, video: Footage, tracks: Tracks) -> float:
-    """Time of the last frame before a quarter of the points begins to move [s]; 0 if it moves in the first frames."""
-    scene = simulation.scene
-    means = scene.model.means.detach()[scene.moving[tracks.index.to(scene.moving.device)]]
-    off = tracks.position - torch.stack([project(means, camera)[0] for camera in video.cameras])
-    moved = (off - off[:1]).norm(dim=-1)
-    moved = torch.where(tracks.seen, moved, torch.nan).nanquantile(0.75, dim=1)
-    begun = (moved > STILL).nonzero()[:, 0]
-    return float(video.times[max(int(begun[0]) - 1, 0)]) if len(begun) else 0.0
 
 
 @torch.no_grad()
@@ -150,7 +190,7 @@ def match(
                 shift = torch.zeros_like(shift) if moving else shift
             position[k] += share * beside
         position[k] -= shift
-    return Tracks(chosen, position, seen)
+    return Tracks(simulation, video, chosen, position, seen)
 
 
 def _at_rest(off: Tensor, beside: Tensor) -> tuple[float, Tensor]:

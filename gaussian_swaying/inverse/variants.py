@@ -1,21 +1,29 @@
-"""Variants of a simulation with other values of the unknowns, moved as batches."""
+"""Variants of a simulation with other values of the unknowns, moved as batches, and how far they are from films."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 
 from gaussian_swaying._fixed import assign
-from gaussian_swaying.inverse.plan import FILM_START, OF_FILM, Values, model_of
+from gaussian_swaying.inverse.least_squares import Block
+from gaussian_swaying.inverse.plan import FILM_START, OF_FILM, Unknown, Values, model_of
+from gaussian_swaying.inverse.tracks import Tracks
 from gaussian_swaying.mpm.state import State
+from gaussian_swaying.rendering.cameras.camera import project
 from gaussian_swaying.simulation.measure import SimulationDiverged
 from gaussian_swaying.simulation.model import Model, number
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.simulation.step import Stepper, why_not_batched
 from gaussian_swaying.wind.force import with_added_mass
+
+MOMENTS = 4  # parts of the time: clusters
+NOISE = 0.5  # distance of a track that its own error explains [pixels]
+HELD, LEAST_HELD = 7, 6  # one of so many tracks is not fitted, if there are at least so many of them
 
 
 @dataclass
@@ -33,8 +41,8 @@ class _Group:
         return max(end - self.start, 0.0) - max(begin - self.start, 0.0)
 
 
-def check_variants(simulation: Simulation) -> None:
-    """Raise ValueError if a simulation has parts that cannot be a batch: timed edits, contact, shelter, copies."""
+def check_variants(simulation: Simulation, unknowns: Sequence[Unknown]) -> None:
+    """Raise ValueError if a simulation has parts that are no batch, such as timed edits, or no such unknown."""
     why = why_not_batched(simulation.model)
     if simulation.editor.edits:
         why = "`edits` change its material; put it into `material`"
@@ -42,6 +50,7 @@ def check_variants(simulation: Simulation) -> None:
         why = "it has `copies`, and a video shows one object; remove them"
     if why is not None:
         raise ValueError(f"The base cannot be fitted through: {why}.")
+    model_of(simulation.model, {unknown.name: unknown.value(0.5) for unknown in unknowns})
 
 
 @torch.no_grad()
@@ -116,3 +125,103 @@ def _stiffness_class(model: Model) -> int:
     points = with_added_mass(model.points, model.scene.patches, model.aero)
     squared = (points.youngs_modulus * points.volume / points.mass).amax()
     return round(2 * math.log2(float(squared)))
+
+
+def compare(
+    evidence: Sequence[Tracks],
+    values: Sequence[Values],
+    times: Sequence[float],
+    moving: bool = False,
+    tick: Callable[[int], object] = int,
+    starts: Sequence[float] = (),
+) -> list[Block]:
+    """Simulate variants of the evidence's simulation, and compare each with the videos at times [s].
+
+    At 0 they are compared only if the videos begin in motion. They have the same substeps unless one diverges. With
+    ``starts``, of a wind that does not depend on time, there is a block for each of them: what the residuals were if
+    all had begun to move then, from one simulation.
+    """
+    wanted: dict[float, tuple[float, list[tuple[int, float]]]] = {}  # what is compared with a state, by its time
+    for k, start in enumerate(starts or [0.0]):
+        for time in times:
+            _, what = wanted.setdefault(round(max(0.0, time - start), 6), (max(0.0, time - start), []))
+            what += [(k, time)] if time > 0 or moving else []  # at rest all variants are alike
+    own = [{name: v for name, v in one.items() if name != FILM_START} for one in values] if starts else values
+    moments = [wanted[key] for key in sorted(wanted)]
+
+    def compared(alike: bool) -> list[Block]:
+        parts: list[list[tuple[Tensor, Tensor, Tensor]]] = [[] for _ in starts or [0.0]]
+        runs = states_of(evidence[0].simulation, own, [moment for moment, _ in moments], alike)
+        for k, ((_, what), states) in enumerate(zip(moments, runs, strict=True)):
+            tick(len(values))
+            for part in evidence if what else ():
+                shown = part.shown(states)
+                for block, time in what:
+                    if (frame := part.video.frame_at(time)) is not None:
+                        found, cluster = part.beside(shown, frame)
+                        moment = torch.full_like(cluster, k * MOMENTS // len(moments))
+                        parts[block].append((found, cluster, moment))
+        joined = (zip(*own, strict=True) for own in parts)
+        return [Block(torch.cat(list(r), 1), torch.cat(list(c)), torch.cat(list(m))) for r, c, m in joined]
+
+    try:
+        return compared(not starts)
+    except SimulationDiverged:
+        return compared(False)
+
+
+def explained(parts: Sequence[Tracks], values: Values, times: Sequence[float]) -> dict[str, float]:
+    """The share of the motion of tracks that were not fitted which their simulation explains, by camera, 0 to 1.
+
+    A track that slipped off the object explains nothing, no less: one of them would decide the sum of all.
+    """
+    sums = [torch.zeros(2, len(part.rest), dtype=torch.float64) for part in parts]
+    for k, frame, pixel in _pixels(parts, values, times):
+        part = parts[k]
+        seen = part.seen[frame]
+        there = part.position[frame, seen]
+        rest = project(part.rest.cpu()[seen], part.video.cameras[frame])[0]
+        left = ((pixel[seen] - there).square().sum(-1) - NOISE**2).clamp(min=0).nan_to_num(torch.inf)
+        sums[k][:, seen] += torch.stack([left, (there - rest).square().sum(-1)])
+    return {
+        part.video.name: 1 - float(torch.minimum(left, moved).sum() / moved.sum())
+        for part, (left, moved) in zip(parts, sums, strict=True)
+        if bool(moved.any())
+    }
+
+
+def split(tracks: Tracks) -> tuple[Tracks, Tracks]:
+    """The tracks that are fitted, and those that judge the fit; all of them for both if there are too few."""
+    held = tracks.index % HELD == 0
+    if int(held.sum()) < LEAST_HELD:
+        return tracks, tracks
+    return replace(tracks, seen=tracks.seen & ~held), replace(tracks, seen=tracks.seen & held)
+
+
+def trusted(
+    evidence: Sequence[Tracks], others: Sequence[Simulation], values: Values, times: Sequence[float]
+) -> list[Tracks]:
+    """Return evidence whose points count less where, and when, other grids move them otherwise.
+
+    Such residuals would pull the values to where they make up for the grid. They are multiplied by
+    :math:`(1 + d^2 / n^2)^{-1/2}`, with the root mean square distance d on the other grids, and the error n of a track.
+    """
+    if not others:
+        return list(evidence)
+    own = {(k, frame): pixel for k, frame, pixel in _pixels(evidence, values, times)}
+    squares = {key: torch.zeros(len(pixel), dtype=torch.float64) for key, pixel in own.items()}
+    for other in others:
+        for k, frame, pixel in _pixels([replace(part, simulation=other) for part in evidence], values, times):
+            off = torch.nan_to_num(pixel - own[k, frame])  # NaN: it diverged
+            squares[k, frame] += off.square().sum(-1) / (2 * len(others))
+    trust = [torch.ones(part.seen.shape, dtype=torch.float64) for part in evidence]
+    for (k, frame), square in squares.items():
+        trust[k][frame] = (1 + square / NOISE**2).rsqrt()
+    return [replace(part, trust=own) for part, own in zip(evidence, trust, strict=True)]
+
+
+def _pixels(parts: Sequence[Tracks], values: Values, times: Sequence[float]) -> Iterator[tuple[int, int, Tensor]]:
+    for time, states in zip(times, states_of(parts[0].simulation, [values], times, alike=False), strict=True):
+        for k, part in enumerate(parts):
+            if (frame := part.video.frame_at(time)) is not None:
+                yield k, frame, part.pixels(part.shown(states), frame)[0]

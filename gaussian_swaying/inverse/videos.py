@@ -6,7 +6,7 @@ import logging
 import math
 import os
 from bisect import bisect_left
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing
 from copy import copy
 from dataclasses import dataclass
@@ -17,6 +17,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -55,18 +56,11 @@ class Footage:
         return found if found < len(self.times) and self.times[found] < time + CLOSE else None
 
 
-Shot = tuple[float, Camera, Tensor]  # time [s], camera and image of a frame
-
-
 class _Room:
-    """What the videos of a fit may still decode, and near plane and origin of their cameras."""
+    """What the videos of a fit may still decode."""
 
-    def __init__(self, near: float, origin: Origin) -> None:
-        self.bytes, self.near, self.origin = MOST_BYTES, near, origin
-
-    def camera(self, world_to_camera: Tensor, lens: Lens) -> Camera:
-        pose = counted_pose(world_to_camera, self.origin).float()
-        return Camera(pose, lens.intrinsics().float(), lens.width, lens.height, self.near)
+    def __init__(self) -> None:
+        self.bytes = MOST_BYTES
 
     def take(self, path: Path, width: int, height: int, frames: int = 1) -> None:
         """Count frames of a file."""
@@ -79,7 +73,7 @@ class _Room:
             )
 
 
-Part = tuple[float, Callable[[_Room], list[Shot]] | Path]  # frames from a time [s] on; or a missing picture
+Shots = tuple[Tensor, Lens, list[Tensor], float]  # pose, lens without distortion, pictures, and their rate [1/s]
 
 
 def read_videos(
@@ -96,13 +90,12 @@ def read_videos(
         size: Size of what they show [scene units], which the near plane of the cameras follows.
         origin: Point of the files from which the places of the splat count.
     """
-    several = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
-    if not several:
-        raise ValueError("Expected `videos` to name a folder with transforms.json.")
-    parts: dict[str, list[Part]] = {}
-    for number, path in enumerate(map(Path, several)):
-        for name, own in _read(path).items():
-            parts.setdefault(name if len(several) == 1 or name not in parts else f"{number}-{name}", []).extend(own)
+    parts: dict[str, list[tuple[float, Callable[[_Room], Shots] | Path]]] = {}  # a path is a missing picture
+    owners: dict[str, int] = {}
+    for number, path in enumerate([paths] if isinstance(paths, str | os.PathLike) else paths):
+        for name, time, part in _read(Path(path)):
+            own = name if owners.setdefault(name, number) == number else f"{number}-{name}"
+            parts.setdefault(own, []).append((time, part))
     begin = min(time for own in parts.values() for time, _ in own)
     for name in cameras or ():
         if name not in parts:
@@ -114,11 +107,17 @@ def read_videos(
             f"{len(lost)} of the pictures of `videos` do not exist, the first of them {lost[0]}: put them there, or "
             "remove their frames from transforms.json."
         )
-    room = _Room(NEAR * size, origin)
-    return [
-        _footage(name, [shot for _, part in own if not isinstance(part, Path) for shot in part(room)], begin)
-        for name, own in wanted.items()
-    ]
+    room, found = _Room(), []
+    for name, own_parts in wanted.items():
+        shots: list[tuple[float, Camera, Tensor]] = []
+        for time, part in own_parts:
+            assert not isinstance(part, Path)
+            view, lens, images, rate = part(room)
+            pose = counted_pose(view, origin).float()
+            camera = Camera(pose, lens.intrinsics().float(), lens.width, lens.height, NEAR * size)
+            shots += [(time + k / rate, camera, image) for k, image in enumerate(images)]
+        found.append(_footage(name, shots, begin))
+    return found
 
 
 def frame_times(videos: Sequence[Footage]) -> list[float]:
@@ -130,7 +129,7 @@ def frame_times(videos: Sequence[Footage]) -> list[float]:
     return found
 
 
-def _footage(name: str, shots: list[Shot], begin: float) -> Footage:
+def _footage(name: str, shots: list[tuple[float, Camera, Tensor]], begin: float) -> Footage:
     taken, cameras, images = zip(*sorted(shots, key=itemgetter(0)), strict=True) if shots else ((), (), ())
     for before, after in pairwise(taken):
         if after - before < 1e-6:
@@ -146,83 +145,70 @@ def _footage(name: str, shots: list[Shot], begin: float) -> Footage:
     return Footage(name, tuple(time - begin for time in taken), cameras, torch.stack(images))
 
 
-def _read(path: Path) -> dict[str, list[Part]]:
+def _read(path: Path) -> Iterator[tuple[str, float, Callable[[_Room], Shots] | Path]]:
+    """Camera, time [s] and reader of each picture and film."""
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist: set `videos` to a folder with transforms.json.")
     files = transforms_files(path)
     if not files:
         raise ValueError(f"{path} has no transforms.json: write one with the cameras and times of the frames.")
-    parts: dict[str, list[Part]] = {}
     for file, _ in files:
-        data, where = load_transforms(file), f"`{file}`"
-        stills = any("video_path" not in frame for frame in data["frames"])
-        posed = {item.name: item for item in read_transforms(file)[0]} if stills else {}
+        data, where, posed = load_transforms(file), f"`{file}`", {item.name: item for item in read_transforms(file)[0]}
         for k, frame in enumerate(data["frames"]):
-            time = read_number(where, frame, "time")
-            own: Callable[[_Room], list[Shot]] | Path = partial(_film, file, where, data, k, time or 0.0)
-            if "video_path" not in frame:
-                name = clean_name(str(frame.get("file_path", "")))
-                if time is None:
-                    raise ValueError(f"The field `frames[{k}].time` of the camera file {where} is missing: add it [s].")
-                own = partial(_picture, posed[name], time) if name in posed else file.parent / name
-            parts.setdefault(_camera_name(where, k, frame), []).append((time or 0.0, own))
-    return parts
+            time, field = read_number(where, frame, "time"), "camera" if "camera" in frame else "camera_name"
+            camera = str(frame.get(field, "0"))
+            if "/" in camera or "\\" in camera:  # files are named after it
+                raise ValueError(
+                    f"The field `frames[{k}].{field}` of the camera file {where} is {camera!r}: set it to a name "
+                    "without / and \\."
+                )
+            if "video_path" in frame:
+                yield camera, time or 0.0, partial(_film, file, where, data, k)
+                continue
+            if time is None:
+                raise ValueError(f"The field `frames[{k}].time` of the camera file {where} is missing: add it [s].")
+            name = clean_name(str(frame.get("file_path", "")))
+            yield camera, time, partial(_picture, posed[name]) if name in posed else file.parent / name
 
 
-def _camera_name(where: str, index: int, frame: dict[str, Any]) -> str:
-    field = "camera" if "camera" in frame else "camera_name"
-    name = str(frame.get(field, "0"))
-    if "/" in name or "\\" in name:  # files are named after it
-        raise ValueError(
-            f"The field `frames[{index}].{field}` of the camera file {where} is {name!r}: set it to a name without / "
-            "and \\."
-        )
-    return name
-
-
-def _picture(item: PosedImage, time: float, room: _Room) -> list[Shot]:
+def _picture(item: PosedImage, room: _Room) -> Shots:
     room.take(item.path, item.lens.width, item.lens.height)
-    camera = room.camera(item.world_to_camera, item.lens.undistorted())
     turned = is_turned(*image_head(item.path), (item.lens.width, item.lens.height))
     pixels = load_image(item.path, item.lens, turned=bool(turned))
-    return [(time, camera, pixels[..., :3].contiguous())]
+    return item.world_to_camera, item.lens.undistorted(), [pixels[..., :3].contiguous()], 1.0
 
 
-def _film(file: Path, where: str, data: dict[str, Any], index: int, begin: float, room: _Room) -> list[Shot]:
+def _film(file: Path, where: str, data: dict[str, Any], index: int, room: _Room) -> Shots:
     entry = data["frames"][index]
     path = check_regular(file.parent / str(entry["video_path"]), "the video")
     fps, begun, seconds = (read_number(where, entry, name) for name in ("fps", "begin", "seconds"))
     wanted = [read_number(where, {name: data.get(name)} | entry, name) for name in ("w", "h")]
-    shots: list[Shot] = []
     taken = [] if not begun else ["-ss", f"{begun:.6f}"]
     taken += [] if seconds is None else ["-t", f"{seconds:.6f}"]
+    images: list[Tensor] = []
     with closing(frames_of(path, taken, scaled(*wanted))) as film:
-        head = next_of(film, path)
-        size = (0, 0) if head is None else check_wide(path, *head["size"])
+        head = next(film)
+        size = check_wide(path, *head["size"])
         lens = lens_of_transforms(where, data, entry, size)
         if (lens.width, lens.height) != size:
             raise ValueError(f"The video {path} is not {lens.width} x {lens.height} as its camera in {where} says.")
-        seen = lens.undistorted()
         pose = read_pose(where, data, index)
         check_rigid(f"The field `frames[{index}].transform_matrix` of the camera file {where}", pose)
-        camera = room.camera(torch.linalg.inv(pose), seen)
         rate = fps or head["fps"]
         if not rate > 0:
             raise ValueError(f"The video {path} does not say its frame rate: add `fps` to its entry in {where}.")
         length = min(head["duration"] - (begun or 0), math.inf if seconds is None else seconds)
         copy(room).take(path, *size, frames=int(head["fps"] * max(length, 0)))  # what it says; it may have more
-        while (frame := next_of(film, path)) is not None:
+        for frame in film:
             room.take(path, *size)
-            picture = torch.frombuffer(bytearray(frame), dtype=torch.uint8).reshape(size[1], size[0], 3)
-            if lens.distorted:
-                picture = remapped(picture, lens)
-            shots.append((begin + len(shots) / rate, camera, picture))
-    if not shots and 0 < head["duration"] <= (begun or 0):
+            picture = torch.from_numpy(frame)
+            images.append(remapped(picture, lens) if lens.distorted else picture)
+    if not images and 0 < head["duration"] <= (begun or 0):
         raise ValueError(
             f"The field `frames[{index}].begin` of the camera file {where} is {begun:g} s, behind the end of the film "
             f"{path} at {head['duration']:g} s: set it to a time in the film."
         )
-    return shots
+    return torch.linalg.inv(pose), lens.undistorted(), images, rate
 
 
 def check_wide(path: Path, width: int, height: int) -> tuple[int, int]:
@@ -243,20 +229,29 @@ def frames_of(
     Of a variable rate, ffmpeg would repeat frames up to a higher one.
 
     Yields:
-        The head as of imageio-ffmpeg, whose ``fps`` is 0 if it is not known, then the bytes of each frame: one a pixel
-        if ``grey``, else three.
+        The head as of imageio-ffmpeg, whose ``fps`` is 0 if it is not known, then each frame, dtype uint8, shape
+        (H, W) if ``grey``, else (H, W, 3).
     """
     from imageio_ffmpeg import read_frames
 
     kind = {"pix_fmt": "gray", "bits_per_pixel": 8} if grey else {}
     limits = ["-max_pixels", str(MOST_PIXELS)]
-    with closing(read_frames(path, input_params=limits, output_params=["-frames:v", "1"])) as film:
-        rate = _rate(next(film)["fps"])
-    steady = ["-r", str(rate)] if rate else []
-    given: dict[str, Any] = {"input_params": [*limits, *inputs], "output_params": [*steady, *outputs]}
-    with closing(read_frames(path, **given, **kind)) as film:
-        yield next(film) | {"fps": float(rate)}
-        yield from film
+    try:
+        with closing(read_frames(path, input_params=limits, output_params=["-frames:v", "1"])) as film:
+            rate = _rate(next(film)["fps"])
+        steady = ["-r", str(rate)] if rate else []
+        given: dict[str, Any] = {"input_params": [*limits, *inputs], "output_params": [*steady, *outputs]}
+        with closing(read_frames(path, **given, **kind)) as film:
+            head = next(film)
+            shape = (*head["size"][::-1], *([] if grey else [3]))
+            yield head | {"fps": float(rate)}
+            for frame in film:
+                yield np.frombuffer(bytearray(frame), dtype=np.uint8).reshape(shape)
+    except Exception as error:  # ffmpeg's errors are of many kinds
+        if "max pixel count" in str(error):
+            raise ValueError(f"The video {path} has more than {MOST_PIXELS:,} pixels: make it smaller.") from None
+        told = str(error).splitlines()[0]
+        raise ValueError(f"The video {path} cannot be read ({told}): convert it to mp4.") from error
 
 
 def _rate(stated: float) -> Fraction:
@@ -272,15 +267,3 @@ def scaled(width: float | None, height: float | None) -> list[str]:
     if not (width and height):
         return []
     return ["-vf", f"scale={width:.0f}:{height:.0f}:force_original_aspect_ratio=decrease:flags=area"]
-
-
-def next_of(film: Any, path: Path) -> Any:
-    """Return the next item of ffmpeg's generator (the metadata, then frames); None at the end."""
-    try:
-        return next(film, None)
-    except Exception as error:  # ffmpeg's errors are of many kinds
-        if "max pixel count" in str(error):
-            raise ValueError(f"The video {path} has more than {MOST_PIXELS:,} pixels: make it smaller.") from None
-        raise ValueError(
-            f"The video {path} cannot be read ({str(error).splitlines()[0]}): convert it to mp4."
-        ) from error

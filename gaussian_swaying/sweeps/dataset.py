@@ -6,6 +6,7 @@ import json
 import math
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from gaussian_swaying._inputs import read_json
 from gaussian_swaying.recording.checkpoint import first_change
 from gaussian_swaying.recording.nodes import load_nodes
 from gaussian_swaying.recording.trajectory import load_trajectory
-from gaussian_swaying.runs.folder import hold_folder
+from gaussian_swaying.runs.folder import claim_folder, hold_folder
 from gaussian_swaying.runs.lock import FolderLock
 from gaussian_swaying.sweeps.plan import Plan
 
@@ -41,13 +42,13 @@ def open_folder(folder: Path, plan: Plan, resume: bool, together: int = 1) -> Fo
     """Make the folder of a sweep, or check the one that is continued; returns its lock, to be released at the end."""
     import yaml
 
-    held, foreign = (folder / SWEEP).exists(), [name for name in OURS if os.path.lexists(folder / name)]
+    held, remedy = (folder / SWEEP).exists(), "choose another with --output"
     if resume and not held:
         raise ValueError(f"There is nothing to resume in {folder}: it has no {SWEEP}; leave out --resume.")
-    if foreign and not resume:
-        what = "holds a sweep already: add --resume to do what is missing in it"
-        what = what if held else f"contains {foreign[0]} of something else"
-        raise ValueError(f"The output folder {folder} {what}: choose another --output.")
+    if held and not resume:
+        raise ValueError(
+            f"The output folder {folder} holds a sweep already: add --resume to do what is missing in it, or {remedy}."
+        )
     new: Any = {"made_by": "gaussian_swaying", "format": 1, "frames": plan.frames, "runs": list(map(dict, plan.runs))}
     new |= {"splats": dict(plan.splats), "config": yaml.safe_load(plan.config)}
     new = json.loads(json.dumps(new | ({"together": together} if together > 1 else {})))  # as it is read again
@@ -55,13 +56,8 @@ def open_folder(folder: Path, plan: Plan, resume: bool, together: int = 1) -> Fo
         what = f"it has {len(old['runs'])} runs, and now there are {len(new['runs'])}"
         if len(old["runs"]) == len(new["runs"]):
             what = first_change(json.dumps(old), json.dumps(new))
-        remedy = "restore them, or choose another --output."
-        raise ValueError(f"{folder} holds a sweep with other settings ({what}): {remedy}")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(f"{folder} cannot be written ({error.strerror}): choose another --output.") from error
-    lock = hold_folder(folder, "choose another with --output")
+        raise ValueError(f"{folder} holds a sweep with other settings ({what}): restore them, or {remedy}.")
+    lock = hold_folder(folder, remedy) if held else claim_folder(folder, OURS, remedy)
     try:
         remove_temporaries(folder)  # of a sweep that was killed while writing
         if not held:
@@ -93,19 +89,18 @@ def read_result(folder: Path, name: str) -> dict[str, Any] | None:
     """The result of a run; None if it has not ended."""
     if not (path := result_file(folder, name)).exists():
         return None
-    try:
+    result = None
+    with suppress(ValueError):
         result = read_json(path, "result")
-        result["status"].lower()
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise ValueError(f"{path} is damaged ({error}): remove it, and --resume does its run again.") from error
-    return dict(result)
+    if not isinstance(result, dict) or not isinstance(result.get("status"), str):
+        raise ValueError(f"{path} is damaged: remove it, and --resume does its run again.")
+    return result
 
 
 def result_of(summary: Mapping[str, Any], attempt: int, where: str) -> dict[str, Any]:
     """The result of a complete run."""
-    figures = {name: summary.get(name) for name in FIGURES}
     end = summary.get("energy_end_J") or {}
-    figures |= {f"{name}_end_J": end.get(name) for name in ENERGIES}
+    figures = {name: summary.get(name) for name in FIGURES} | {f"{name}_end_J": end.get(name) for name in ENERGIES}
     figures["warnings"] = len(summary.get("warnings") or ())
     result = {"status": summary["status"], "reason": None, "figures": figures, "attempts": attempt, "where": where}
     return result | {name: summary.get(name) for name in ("wall_s", "peak_memory_bytes")}

@@ -89,12 +89,10 @@ def read_axis(name: str, given: Any) -> Axis:
 
 
 def _finite(where: str, value: Any) -> float:
-    number = math.nan
     with suppress(ValueError, TypeError, OverflowError):
-        number = math.nan if isinstance(value, bool) else float(value)
-    if not math.isfinite(number):
-        raise ValueError(f"Expected `{where}` to be a finite number, but got {value!r}: set it.")
-    return number
+        if not isinstance(value, bool) and math.isfinite(float(value)):
+            return float(value)
+    raise ValueError(f"Expected `{where}` to be a finite number, but got {value!r}: set it.")
 
 
 def runs_of(axes: Mapping[str, Axis], draws: int = 1, seed: int = 0) -> list[dict[str, Any]]:
@@ -106,19 +104,17 @@ def runs_of(axes: Mapping[str, Axis], draws: int = 1, seed: int = 0) -> list[dic
         >>> runs_of({"a": [1, 2], "b": [3, 4]})
         [{'a': 1, 'b': 3}, {'a': 1, 'b': 4}, {'a': 2, 'b': 3}, {'a': 2, 'b': 4}]
     """
-    lists = [axis for axis in axes.values() if isinstance(axis, list)]
+    lists = {name: axis for name, axis in axes.items() if isinstance(axis, list)}
     if draws > 1 and len(lists) == len(axes):
         raise ValueError(f"Expected an axis with a `draw`, as `draws` is {draws}: add one, or set `draws` to 1.")
-    count = math.prod(map(len, lists)) * draws
+    count = math.prod(map(len, lists.values())) * draws
     if count > MOST_RUNS:
         raise ValueError(f"The axes make {count:,} runs, more than the limit of {MOST_RUNS:,}: give fewer values.")
     runs = []
-    for number, (*values, _) in enumerate(itertools.product(*lists, range(draws))):
-        listed, run = iter(values), {}
-        for name, axis in axes.items():
-            drawn = None if isinstance(axis, list) else axis(random.Random(f"{seed}/{name}/{number}"))
-            run[name] = next(listed) if isinstance(axis, list) else drawn
-        runs.append(run)
+    for number, (*values, _) in enumerate(itertools.product(*lists.values(), range(draws))):
+        run = dict(zip(lists, values, strict=True))
+        drawn = {n: axis(random.Random(f"{seed}/{n}/{number}")) for n, axis in axes.items() if callable(axis)}
+        runs.append({name: (run | drawn)[name] for name in axes})
     return runs
 
 
@@ -221,8 +217,7 @@ def _options(file: Path, field_: str, given: Any) -> dict[str, Any]:
     for name in given:
         if name in NOT_HERE or name.startswith("-"):
             raise ValueError(
-                f"`{field_}` of {file} has `{name}`, which is no option of a run in a sweep: remove it"
-                + (" and the dashes." if name.startswith("-") else "; the sweep has options of its own.")
+                f"`{field_}` of {file} has `{name}`: remove it, as the sweep has its own, or the dashes before it."
             )
     try:
         json.dumps(given, allow_nan=False)

@@ -106,7 +106,7 @@ def test_a_film_that_does_not_say_its_length(case, checked, tmp_path):
 @pytest.fixture(scope="module")
 def seen(case):
     film, cloud, camera = open_film(case / "film.mp4"), read_gaussians(case / "my.ply", 0), camera_of(270, 480)
-    return Seen(film, film.first_frame(), cloud, camera, painter_of(cloud)(camera), 0.0), guess(cloud)
+    return Seen(film, cloud, camera, painter_of(cloud)(camera), 0.0), guess(cloud)
 
 
 def test_known_lengths(seen):
@@ -202,7 +202,7 @@ def test_bad_options(words, told, tmp_path, monkeypatch, capsys):
     ("shown", "told"), [(False, "was not found in the first frame"), (True, "Nothing moves in the film")]
 )
 def test_films_that_do_not_work(case, shown, told, capsys):
-    first = open_film(case / "film.mp4").first_frame().numpy() if shown else np.full((480, 270, 3), 90, np.uint8)
+    first = open_film(case / "film.mp4").first.numpy() if shown else np.full((480, 270, 3), 90, np.uint8)
     encoder = VideoEncoder(case / "other.mp4", 30)
     for _ in range(5):
         encoder.write(first)

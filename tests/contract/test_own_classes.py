@@ -20,8 +20,8 @@ from gaussian_swaying.cli import sweep
 from gaussian_swaying.cli.simulate import main
 from gaussian_swaying.config.parser import COMMON, OPTIONS
 from gaussian_swaying.gaussians.formats import FORMATS
-from gaussian_swaying.inverse.plan import check_unknowns, read_plan
-from gaussian_swaying.inverse.variants import states_of
+from gaussian_swaying.inverse.plan import read_plan
+from gaussian_swaying.inverse.variants import check_variants, states_of
 from gaussian_swaying.player.panel import Panel
 from gaussian_swaying.player.session import Session
 from gaussian_swaying.rendering.passes import PASSES
@@ -113,7 +113,7 @@ def test_an_unknown_of_a_fit(extensions, tmp_path):
     (unknown,) = read_plan(tmp_path / "fit.yaml").unknowns
     assert (unknown.name, unknown.low, unknown.high) == ("wind.modulations.0.growth", 0.1, 8.0)
     simulation = made({"wind.flow": [0, 2, 0], "wind.modulations": [own("Squall", growth=1.0)]})
-    check_unknowns(simulation, [unknown])
+    check_variants(simulation, [unknown])
     *_, ends = states_of(simulation, [{unknown.name: value} for value in (0.1, 8.0)], [0.0, 0.2])
     slow, fast = ((state.position - simulation.scene.points.position)[:, 1].mean() for state in ends)
     assert fast > 1.5 * slow > 0

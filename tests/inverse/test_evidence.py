@@ -1,23 +1,24 @@
 """Residuals of points that are followed: their weights, clusters, and trust in them."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from small_films import changed
 
-import gaussian_swaying.inverse.evidence as module
-from gaussian_swaying.inverse.evidence import NOISE, PATCHES, Evidence, compare, explained, split, trusted
-from gaussian_swaying.inverse.tracks import Tracks, track
-from gaussian_swaying.inverse.variants import states_of
+import gaussian_swaying.inverse.variants as module
+from gaussian_swaying.inverse.tracks import PATCHES, Tracks, track
+from gaussian_swaying.inverse.variants import NOISE, compare, explained, split, states_of, trusted
 from gaussian_swaying.inverse.videos import read_videos
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")
 
 
 def _nothing(simulation, video):
-    """Evidence of all Gaussians at the corner of every frame."""
+    """Tracks of all Gaussians at the corner of every frame."""
     count, frames = len(simulation.scene.moving), len(video.times)
     seen = torch.ones(frames, count, dtype=torch.bool)
-    return Evidence(simulation, video, Tracks(torch.arange(count), torch.zeros(frames, count, 2).double(), seen))
+    return Tracks(simulation, video, torch.arange(count), torch.zeros(frames, count, 2).double(), seen)
 
 
 def test_a_track_that_slips_explains_nothing_and_no_less(own, simulation):
@@ -30,8 +31,8 @@ def test_a_track_that_slips_explains_nothing_and_no_less(own, simulation):
     slipped = 2.0 * (len(position) - 1)
     assert moved[3] > 10 * slipped
     seen = torch.ones(position.shape[:2], dtype=torch.bool)
-    tracks = Tracks(torch.arange(len(simulation.scene.moving))[-4:], position, seen)
-    found = explained([Evidence(simulation, video, split(tracks)[1])], {}, video.times)[video.name]
+    tracks = Tracks(simulation, video, torch.arange(len(simulation.scene.moving))[-4:], position, seen)
+    found = explained([split(tracks)[1]], {}, video.times)[video.name]
     assert found == pytest.approx(float(moved[:3].sum() / (moved[:3].sum() + slipped)), rel=1e-3)
 
 
@@ -50,7 +51,7 @@ def test_tracks_share_their_clusters_over_cameras(own, simulation):
 @pytest.fixture
 def left(own, simulation):
     (video, _) = read_videos(own / "video")
-    return Evidence(simulation, video, track(simulation, video, 40))
+    return track(simulation, video, 40)
 
 
 def test_points_count_by_how_far_another_grid_moves_them(own, left):
@@ -58,11 +59,11 @@ def test_points_count_by_how_far_another_grid_moves_them(own, left):
     finer = changed(own, solver={"dx": 0.08})
     times = left.video.times[:7]
     (part,) = trusted([left], [finer], {}, times)
-    compared = {"own": left, "other": left.on(finer), "less": part}
+    compared = {"own": left, "other": replace(left, simulation=finer), "less": part}
     values = {name: compare([one], [{}], times, moving=True)[0].values[0] for name, one in compared.items()}
     away = (values["other"] - values["own"]).norm(dim=-1)
     expected = (1 + 0.5 * away.square() / NOISE**2).rsqrt()
-    first = int(left.tracks.seen[0].sum())
+    first = int(left.seen[0].sum())
     assert expected[:first].tolist() == pytest.approx([1.0] * first, abs=1e-4)
     assert expected.min() < 0.9
     torch.testing.assert_close(values["less"], expected[:, None] * values["own"], rtol=1e-3, atol=1e-4)

@@ -105,8 +105,8 @@ def test_a_large_film_is_read_in_reduced_size(tmp_path, monkeypatch):
     with value_error(r"narrow\.mp4 are read with 80 x 1 pixels, and an object needs 16"):
         open_film(narrow)
     film = open_film(_film(tmp_path / "a.mp4", [_square(60)] * 5))
-    assert (film.width, film.height, film.full, film.fps) == (80, 48, 2.0, 25.0)
-    frame = film.first_frame()
+    assert (film.size, film.full, film.fps) == ((80, 48), 2.0, 25.0)
+    frame = film.first
     assert frame.shape == (48, 80, 3)
     assert float(frame[5, 5].float().mean()) == pytest.approx(90, abs=4)
 

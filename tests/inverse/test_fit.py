@@ -13,8 +13,8 @@ from small_films import TRUTH, changed
 
 import gaussian_swaying.inverse.fit as module
 from gaussian_swaying.cli.fit import main
-from gaussian_swaying.inverse.evidence import HELD
-from gaussian_swaying.inverse.fit import GRIDS, Course, Problem, Say, run_fit
+from gaussian_swaying.inverse.fit import GRIDS, Problem, Say, run_fit
+from gaussian_swaying.inverse.variants import HELD
 from gaussian_swaying.inverse.videos import read_videos
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -67,7 +67,7 @@ def test_another_end_that_fits_as_well_is_a_rival(fit_of):
     here, near, far = [0.5], [0.51], [0.9]
 
     def others(*ended):
-        made._brief = lambda places, evidence, times: ([end for end, _ in ended], [cost for _, cost in ended])
+        made._brief = lambda places, evidence, times: [(cost, end) for end, cost in ended]
         return made.others(here, [far])
 
     assert others((here, 1.0), (far, 1.04)) == [made.values(far)]
@@ -81,7 +81,7 @@ def test_another_end_that_fits_as_well_is_a_rival(fit_of):
 def test_rivals_are_told(fit_of):
     made = fit_of(SPEED, search=0, iterations=1, tracks=40)
     made.others = lambda place, rivals: [{"wind.speed": 9.0}]
-    assert made.run(Course(), lambda course: None).rivals == [{"wind.speed": 9.0}]
+    assert made.run({}, lambda: None).rivals == [{"wind.speed": 9.0}]
 
 
 def test_a_drag_that_is_sought_with_the_speed_is_remarked_on(fit_of):
@@ -97,7 +97,7 @@ def test_some_tracks_are_held_out_and_judge_the_fit(fit_of):
     made = fit_of(SPEED)
     (first, _) = made.evidence()
     (all_of_it, _) = made.tracks
-    held = all_of_it.seen[0] & ~first.tracks.seen[0]
+    held = all_of_it.seen[0] & ~first.seen[0]
     assert 0.1 <= held.sum() / all_of_it.seen[0].sum() <= 0.2
     assert (all_of_it.index[held] % HELD == 0).all()
 
@@ -138,25 +138,25 @@ def test_stopped_and_continued(fit_of, tmp_path):
     def made():
         return fit_of(SPEED | AZIMUTH, search=8, iterations=2, tracks=40, further={"grids": [coarser] * len(GRIDS)})
 
-    whole = made().run(Course(), lambda course: None)
+    whole = made().run({}, lambda: None)
 
     class StopError(Exception):
         pass
 
     seen = []
 
-    def keep(course):
-        seen.append(json.loads(json.dumps(vars(course))))
+    def keep():
+        seen.append(json.loads(json.dumps(course)))
         if len(seen) in (1, 4, 7):
             raise StopError
 
-    course, stops = Course(), 0
+    course, stops = {}, 0
     while True:
         try:
             result = made().run(course, keep)
             break
         except StopError:
-            course, stops = Course(**seen[-1]), stops + 1
+            course, stops = seen[-1], stops + 1
     assert stops == 3
     assert result.place == whole.place
     assert [row["cost"] for row in result.history] == [row["cost"] for row in whole.history]

@@ -12,7 +12,7 @@ from small_films import TRUTH
 
 from gaussian_swaying.inverse.fit import fit
 from gaussian_swaying.inverse.hand import Background, follow_camera, moves_by, prepared
-from gaussian_swaying.inverse.tracks import still_until, track
+from gaussian_swaying.inverse.tracks import track
 from gaussian_swaying.inverse.videos import Footage, read_videos
 from gaussian_swaying.rendering.cameras.camera import project
 from gaussian_swaying.simulation.simulation import Simulation
@@ -98,9 +98,9 @@ def test_a_still_object_is_still_in_a_film_from_a_hand(folder, simulation):
         colour = painter.picture(rest, camera).color.detach()
         video.images[k] = (255 * colour.clamp(0, 1)).round().to(torch.uint8)
     steadied, *_ = follow_camera(video, Background(simulation))
-    assert still_until(simulation, video, track(simulation, video)) < 3 / 30
-    assert still_until(simulation, steadied, track(simulation, steadied)) == 0.0  # nothing begins to move
-    assert still_until(simulation, replace(steadied, cameras=video.cameras), track(simulation, steadied)) < 3 / 30
+    assert track(simulation, video).still_until() < 3 / 30
+    assert track(simulation, steadied).still_until() == 0.0  # nothing begins to move
+    assert replace(track(simulation, steadied), video=replace(steadied, cameras=video.cameras)).still_until() < 3 / 30
 
 
 def test_the_wind_is_found_as_from_a_tripod(folder, simulation, tmp_path):

@@ -14,6 +14,7 @@ from gaussian_swaying.inverse.least_squares import (
     DivergedError,
     _beside,
     cost_of,
+    covariance,
     linearised,
     scale_of,
     solve,
@@ -74,7 +75,7 @@ def test_standard_errors_are_the_scatter_of_repeated_fits():
         residuals = _decay([0.4, 0.3], noise)
         place = _solved(residuals, [0.5, 0.4]).place
         places.append(place)
-        errors.append(linearised(residuals, place, estimated).covariance().diagonal().sqrt())
+        errors.append(covariance(*linearised(residuals, place, estimated)).diagonal().sqrt())
     scatter, told = torch.stack(places).std(0), torch.stack(errors).square().mean(0).sqrt()
     assert (told / scatter).tolist() == pytest.approx([1.0, 1.0], abs=0.3)
 
@@ -98,9 +99,9 @@ def test_sensitivities_are_exact_to_second_order_and_stay_in_the_range():
         weighed = places.square() * torch.tensor([1.0, 3.0])
         return Block(weighed[:, None], torch.zeros(1, dtype=torch.long))
 
-    normal = linearised(squares, double([0.5, 0.25]), scaled(1.0))
-    assert normal.matrix.diagonal().tolist() == pytest.approx([1.0, 1.5**2])
-    assert normal.scores[0].sum(0).tolist() == pytest.approx([0.25 * 1.0, 0.1875 * 1.5])
+    matrix, scores = linearised(squares, double([0.5, 0.25]), scaled(1.0))
+    assert matrix.diagonal().tolist() == pytest.approx([1.0, 1.5**2])
+    assert scores[0].sum(0).tolist() == pytest.approx([0.25 * 1.0, 0.1875 * 1.5])
     assert _beside(double([0.0, 1.0]))[1].min() > 0
     linearised(squares, double([0.0, 1.0]), scaled(1.0))
 
@@ -203,7 +204,7 @@ def _mean(values, cluster, sigma, moment=None):
     def at(places):
         return Block((values.flatten() + places - 0.5)[..., None], cluster, moment)
 
-    return linearised(at, double([0.5]), scaled(sigma)).covariance()
+    return covariance(*linearised(at, double([0.5]), scaled(sigma)))
 
 
 @pytest.mark.parametrize("clusters", [1, 2, 5])

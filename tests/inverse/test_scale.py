@@ -7,9 +7,9 @@ from shared import merged, peak, value_error
 from small_films import changed
 
 from gaussian_swaying.gaussians.ply import write_ply
-from gaussian_swaying.inverse.plan import SCALE, Unknown, check_unknowns
+from gaussian_swaying.inverse.plan import SCALE, Unknown
 from gaussian_swaying.inverse.report import scene_text
-from gaussian_swaying.inverse.variants import states_of
+from gaussian_swaying.inverse.variants import check_variants, states_of
 from gaussian_swaying.scenes.patches import box, to_cloud
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -102,7 +102,7 @@ def test_the_configuration_that_is_written_moves_as_the_fit(tmp_path, changes):
 def test_what_has_a_length_of_its_own_is_refused(tmp_path):
     unknown = Unknown(SCALE, 0.5, 2.0, "log")
     assert unknown.unit == "m"
-    check_unknowns(made(tmp_path, 1.0), [unknown])
+    check_variants(made(tmp_path, 1.0), [unknown])
     gust = [{"class_path": "SineSway"}]
     for changes in (
         {"wind": {"modulations": gust}},
@@ -111,4 +111,4 @@ def test_what_has_a_length_of_its_own_is_refused(tmp_path):
         {"material": {"bending": "plate"}},
     ):
         with value_error("only under `solver.gravity`, in a plain wind .* `scene.layers: 1` and"):
-            check_unknowns(made(tmp_path, 1.0, **changes), [unknown])
+            check_variants(made(tmp_path, 1.0, **changes), [unknown])

@@ -8,12 +8,11 @@ import torch
 from shared import double, longest, peak
 from small_films import TRUTH
 
-from gaussian_swaying.inverse.evidence import Evidence, compare
 from gaussian_swaying.inverse.fit import Problem
 from gaussian_swaying.inverse.plan import FILM_START
 from gaussian_swaying.inverse.registration import first_look
 from gaussian_swaying.inverse.tracks import track
-from gaussian_swaying.inverse.variants import states_of
+from gaussian_swaying.inverse.variants import compare, states_of
 from gaussian_swaying.inverse.videos import read_videos
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")
@@ -97,10 +96,10 @@ def test_rivals_of_a_film_in_motion_are_judged_by_the_points_of_their_own_first_
     monkeypatch.setattr(Problem, "begin_at", begin_at)
     made.begin_at(wrong)
     monkeypatch.setattr("gaussian_swaying.inverse.fit.BRIEF", 0)  # where they are, not where they would go
-    ended, costs = made._brief([wrong, true], None, made.fitted)
+    best, other = made._brief([wrong, true], None, made.fitted)
     assert seen == [wrong, wrong, true]
-    assert ended == [true, wrong]
-    assert costs[1] > 3 * costs[0]
+    assert (best[1], other[1]) == (true, wrong)
+    assert other[0] > 3 * best[0]
     assert made.first == wrong
 
 
@@ -133,9 +132,9 @@ def test_variants_that_started_before_the_film(simulation):
 def test_starts_that_are_compared_at_once(own, simulation):
     """One simulation shows what any start would: as simulations of each start do."""
     (video, _) = read_videos(own / "video")
-    evidence = [Evidence(simulation, video, track(simulation, video))]
+    evidence = [track(simulation, video)]
     times, starts = list(video.times[:5]), [-2 / 24, 0.0, 1 / 24]
-    together = compare(evidence, [{"wind.speed": 4.0}], times, True, starts)
+    together = compare(evidence, [{"wind.speed": 4.0}], times, True, starts=starts)
     apart = [{"wind.speed": 4.0, FILM_START: start} for start in starts]
     (block,) = compare(evidence, apart, times, moving=True)
     for number, own_block in enumerate(together):

@@ -9,7 +9,6 @@ from shared import longest, near
 from small_films import cameras, changed
 
 from gaussian_swaying import Simulation
-from gaussian_swaying.inverse.evidence import Evidence
 from gaussian_swaying.inverse.tracks import _inside, drawn_beside, follow, match, track, window_of
 from gaussian_swaying.inverse.variants import states_of
 from gaussian_swaying.inverse.videos import Footage, read_videos
@@ -50,10 +49,10 @@ def test_a_point_that_vanishes_is_lost():
     assert not seen[2].any()
 
 
-def _off(evidence, state, frame):
+def _off(tracks, state, frame):
     """How far its points that are seen in a frame are from where a state has them [pixels]."""
-    seen = evidence.tracks.seen[frame]
-    return (evidence.pixels(evidence.shown([state]), frame)[0] - evidence.tracks.position[frame])[seen]
+    seen = tracks.seen[frame]
+    return (tracks.pixels(tracks.shown([state]), frame)[0] - tracks.position[frame])[seen]
 
 
 def test_matches_do_not_drift(own, simulation):
@@ -66,8 +65,7 @@ def test_matches_do_not_drift(own, simulation):
         tracks, matches = track(simulation, video), match(simulation, video, near)
         off = {}
         for name, found in (("tracks", tracks), ("matches", matches)):
-            evidence = Evidence(simulation, video, found)
-            parts = [_off(evidence, truth[k], k) for k in range(4, len(times))]
+            parts = [_off(found, truth[k], k) for k in range(4, len(times))]
             off[name] = float(torch.cat(parts).norm(dim=-1).median())
         assert off["matches"] < 0.25
         assert off["matches"] < off["tracks"] < 2
@@ -84,9 +82,9 @@ def test_a_shift_that_is_there_at_rest_is_taken_off_matches(own, simulation):
     times = video.times[:5]
     states = [found[0] for found in states_of(simulation, [{}], times)]
     video = replace(video, cameras=tuple(turned))
-    evidence = Evidence(simulation, video, match(simulation, video, states))
+    matches = match(simulation, video, states)
     for k in range(len(times)):  # the simulation is the truth
-        off = _off(evidence, states[k], k).median(0).values
+        off = _off(matches, states[k], k).median(0).values
         assert off.tolist() == pytest.approx([0.0, 0.0], abs=0.05)
 
 

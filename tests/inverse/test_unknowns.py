@@ -8,7 +8,8 @@ import torch
 from shared import value_error
 from small_films import changed
 
-from gaussian_swaying.inverse.plan import Unknown, apart_by, check_unknowns, mirrored, mirrored_place, read_unknown
+from gaussian_swaying.inverse.plan import Unknown, apart_by, mirrored, mirrored_place, read_unknown
+from gaussian_swaying.inverse.variants import check_variants
 from gaussian_swaying.wind.field import flow_of
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")
@@ -43,12 +44,10 @@ def test_bad_ranges(name, low, high, words):
 
 def test_what_has_no_place_is_refused(simulation, tmp_path):
     with value_error("There is no"):
-        check_unknowns(simulation, [Unknown("wind.modulations.0.amplitude", 0.0, 1.0)])
-    with value_error("twice"):
-        check_unknowns(simulation, [Unknown("wind.speed", 1.0, 2.0)] * 2)
+        check_variants(simulation, [Unknown("wind.modulations.0.amplitude", 0.0, 1.0)])
     still = changed(tmp_path, wind={"flow": [0.0, 0.0, 0.0]})
     with value_error(r"no `wind.flow`"):
-        check_unknowns(still, [Unknown("wind.azimuth", 0.0, 90.0)])
+        check_variants(still, [Unknown("wind.azimuth", 0.0, 90.0)])
 
 
 def test_the_wind_is_mirrored_at_the_normal_of_a_sheet(simulation):
@@ -102,7 +101,7 @@ def test_the_mirrored_wind_lies_within_its_range(simulation):
 def test_a_fit_tries_it_at_its_end(simulation, fit_of):
     """And says if it fits better."""
     made = fit_of({"wind.azimuth": [0.0, 180.0]})
-    made._brief = lambda places, evidence, times: (places[::-1], [1.0, 2.0])
+    made._brief = lambda places, evidence, times: list(zip([1.0, 2.0], places[::-1], strict=True))
     (other,) = made.others([0.3], [])
     assert other == made.values(mirrored_place(simulation.model, made.plan.unknowns, [0.3])[0])
     assert other["wind.azimuth"] == pytest.approx(180 - 54, abs=3.0)
@@ -112,7 +111,7 @@ def test_the_mirrored_wind_is_a_rival_for_longer(fit_of):
     """It differs by less than a model's errors."""
     made = fit_of({"wind.azimuth": [0.0, 180.0]})
     for end, cost, told in ((0.7, 1.2, True), (0.65, 1.2, True), (0.7, 1.3, False), (0.95, 1.2, False)):
-        made._brief = lambda places, evidence, times, end=end, cost=cost: ([places[0], [end]], [1.0, cost])
+        made._brief = lambda places, evidence, times, end=end, cost=cost: [(1.0, places[0]), (cost, [end])]
         assert made.others([0.3], []) == [made.values([end])] * told
 
 

@@ -340,7 +340,7 @@ def test_other_places_where_copies_are_refused(tmp_path):
     with value_error("they have `copies`, which are one already"):
         simulation.batch([simulation.model])
     with value_error("it has `copies`, and a video shows one object; remove them"):
-        check_variants(simulation)
+        check_variants(simulation, [])
     assert list(tmp_path.iterdir()) == []
 
 
