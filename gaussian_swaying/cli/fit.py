@@ -27,8 +27,7 @@ def build_parser() -> argparse.ArgumentParser:
     add("film", nargs="?", metavar="FILM", help="a film that begins with the object at rest")
     add("--splat", metavar="SPLAT", help="the splat that the film shows")
     add("--length", nargs="+", metavar="LENGTH", help="a known length, NAME METRES: object, a part such as pole, or "
-        "X,Y:X,Y, two places in the first frame (pixels); or gravity, if the weight is to tell it; without it, speed "
-        "and E are not absolute")  # fmt: skip
+        "X,Y:X,Y, two places in the first frame (pixels); without it, speed and E are not absolute")  # fmt: skip
     add("--up", nargs="+", metavar="UP", help="+x, -x, ... -z or 3 numbers: up in the splat, instead of a guess")
     add("--hold", metavar="END", help="end that is held: top, bottom, none, +x, ... or -z, instead of a guess")
     add("--focal", type=float, metavar="MM", help="focal length as on 35 mm film; else that of its tags, or found")
@@ -90,15 +89,15 @@ def fit(options: argparse.Namespace, begun: list[str]) -> int:
 
 
 def _length(given: Sequence[str] | None) -> Any:
-    if given is None or list(given) == ["gravity"]:
-        return given and "gravity"
+    if given is None:
+        return None
     metres = " ".join(given[1:]) or "nothing"
     value = math.nan
     with suppress(ValueError):
         value = float(metres)
     if not 0 < value < math.inf:
         raise ValueError(
-            f"Expected `--length` to be gravity, or a name and a length in metres, such as pole 2.4, but got {metres}."
+            f"Expected `--length` to be a name and a length in metres, such as pole 2.4, but got {metres}."
         )
     return given[0], value
 

@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,6 +40,7 @@ from gaussian_swaying.inverse.plan import (
     check_apart,
     make_plan,
     mirrored_place,
+    of_simulation,
     turn,
     values_at,
 )
@@ -94,6 +95,7 @@ class Say:
         self.tick = lambda count: None
 
 
+@dataclass(eq=False)
 class Problem:
     """The unknowns of a simulation, and the videos from which they are found.
 
@@ -101,18 +103,16 @@ class Problem:
     the videos.
     """
 
-    def __init__(
-        self,
-        simulation: Simulation,
-        videos: Sequence[Footage],
-        plan: Plan,
-        say: Say | None = None,
-        grids: Sequence[Simulation] = (),
-        told: Sequence[str] = (),
-        doubts: Sequence[str] = (),
-    ) -> None:
-        self.simulation, self.videos, self.plan = simulation, list(videos), plan
-        self.say, self.grids, self.told, self.doubts = say or Say(False), grids, told, doubts
+    simulation: Simulation
+    videos: Sequence[Footage]
+    plan: Plan
+    say: Say = field(default_factory=lambda: Say(False))
+    grids: Sequence[Simulation] = ()
+    told: Sequence[str] = ()
+    doubts: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        plan, videos = self.plan, self.videos
         self.times = frame_times(videos)
         fitted = max(3, round(0.5 * len(self.times)))
         if plan.until is not None:
@@ -120,14 +120,14 @@ class Problem:
             if fitted < 3:
                 raise ValueError(f"Fewer than three frames lie before `until` = {plan.until:g} s: raise it.")
         self.fitted = self.times[:fitted]
-        check_variants(simulation, plan.unknowns)
+        check_variants(self.simulation, plan.unknowns)
         self.sought = {unknown.name: k for k, unknown in enumerate(plan.unknowns)}
         self.middle = [0.5 if u.start is None else u.share(u.start) for u in plan.unknowns]
         self.begins = plan.unknowns[self.sought[FILM_START]] if FILM_START in self.sought else None
         self.moving = self.begins is not None and self.begins.low < 0
         self.first: list[float] = []
         self._tracks: list[Tracks] | None = None
-        for video in self.videos:  # all cameras have to see the start of the motion, or a state before it
+        for video in videos:  # all cameras have to see the start of the motion, or a state before it
             begin, step = video.times[0], (video.times[-1] - video.times[0]) / max(len(video.times) - 1, 1)
             if begin > max([1.5 * step, *([self.begins.low] if self.begins else [])]):
                 raise ValueError(
@@ -162,7 +162,7 @@ class Problem:
         assert known is not None
         before = torch.linspace(max(0.0, -known.high), -known.low, BEGINS, dtype=torch.float64).tolist()
         brief = [replace(video, images=video.images[:1]) for video in self.videos]
-        values = [{name: v for name, v in self.values(place).items() if name != FILM_START} for place in places]
+        values = [of_simulation(self.values(place)) for place in places]
         found: list[tuple[int, list[float]]] = []
         with self.say.work("where the film begins", len(before) * len(places)):
             for ago, states in zip(before, states_of(self.simulation, values, before, alike=False), strict=True):
@@ -317,9 +317,8 @@ class Problem:
         """Do the steps that ``course`` does not have, put them into it, call ``keep`` after each; return the result.
 
         Of the places in it, shares of the ranges, ``starts`` are those of the search, ``first`` looks like the first
-        frame, or is empty if that shows the scene at rest, and ``rivals`` are ends of other starts. ``places`` has the
-        end of the best start and those of the solves in ``history``, one for each of :data:`STEPS` and more for the
-        last. Films beside the fit are written into a folder.
+        frame if that is not at rest, and ``rivals`` are ends of other starts. ``places`` has the end of the best start
+        and those of the solves in ``history``, one for each of :data:`STEPS` and more for the last.
         """
         clock = time.monotonic() - course.setdefault("seconds", 0.0)
 

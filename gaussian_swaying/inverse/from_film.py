@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -22,12 +22,10 @@ from gaussian_swaying._files import write_json, write_text
 from gaussian_swaying._inputs import check_regular
 from gaussian_swaying.gaussians.cloud import GaussianCloud
 from gaussian_swaying.gaussians.formats import read_gaussians
-from gaussian_swaying.gaussians.grouping import connected_parts
 from gaussian_swaying.gaussians.hold import given_hold
-from gaussian_swaying.gaussians.measures import DIRECTIONS, plane_axes, sides
-from gaussian_swaying.geometry.neighbours import particle_spacing
+from gaussian_swaying.gaussians.measures import plane_axes, sides
 from gaussian_swaying.inverse.fit import run_fit
-from gaussian_swaying.inverse.plan import FILM_START, SCALE, read_plan
+from gaussian_swaying.inverse.plan import FILM_START, read_plan
 from gaussian_swaying.inverse.registration import (
     CAMERAS,
     FOUND,
@@ -36,14 +34,14 @@ from gaussian_swaying.inverse.registration import (
     STILLS,
     fov_of,
     in_space,
-    off_camera,
+    pose_of,
     register,
     shown_in,
     transforms,
 )
 from gaussian_swaying.inverse.report import Fit, side_by_side
 from gaussian_swaying.inverse.tracks import corners, follow, opencv
-from gaussian_swaying.inverse.videos import Footage, check_wide, frames_of, read_videos, scaled
+from gaussian_swaying.inverse.videos import check_wide, frames_of, scaled
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.suggestion.starter import keep_aside, write_starter
@@ -57,19 +55,13 @@ DIAGONAL = math.hypot(36, 24)  # of the film to which a focal length in mm is eq
 FULL = 0.6  # share of the picture that a splat covers which has surroundings: then most of its points stand still
 STRAY, IN_A_ROW = 1.5, 3  # motion of a point where most of the picture is still [pixels], and frames in which some do
 LEAST_SHAKEN = 8  # fewest points that tell how a hand shakes
-END, FLAT, FEWEST = 0.12, 0.3, 5  # length of an end per the whole; of a direction per the longest; points of an end
-STILL, LEAST_MOTION = 0.35, 3.0  # motion of a held end per that of the liveliest quarter; least of that [pixels]
-LIVELY, MOST = 0.25, 0.5  # motion per that of the liveliest fiftieth, and largest share of the points that move
-CELLS, PAD = 24, 0.02  # cells along what moves, within two of which things are connected; margin of its box
 _FOCAL = re.compile(r"focal.?length\S*35mm\S*\s*:\s*([0-9.]+)", re.IGNORECASE)
 PLAN, LOOK, RESULT = "fit.yaml", "preview", "result"
 SECONDS, LEAD = 1.5, 0.4  # time of motion that is fitted, and time at rest that is kept before it [s]
 SOFTER, STIFFER = 1 / 30, 30.0  # range of E, per that which the preview guesses
 SPEED = (0.5, 25.0)  # range of the wind [m/s]
 ROUGH = 1.2e-3  # residual of a camera that may be wrong, per diagonal of the picture
-UPRIGHT, NEARLY = 0.5, 0.85  # cosines to the film's up of a guess that is right, and of an axis that is taken
-SHORTER, LONGER = 0.25, 4.0  # range of lengths, per the guess, if the weight is to tell them
-Length = tuple[str, float] | Literal["gravity"] | None
+Length = tuple[str, float] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,68 +122,42 @@ def view_of_focal(millimetres: float, width: int, height: int) -> float:
     return 2 * math.degrees(math.atan(0.5 * height * DIAGONAL / (millimetres * math.hypot(width, height))))
 
 
-class Points:
-    """Points of a splat in the grey first frame of a film, at rest, and points around it, which tell how a hand shakes.
-
-    The splat is drawn from the camera of the first frame, perhaps larger. If it is ``full``, it covers most of the
-    picture, and most of its points stand still.
-    """
-
-    def __init__(self, grey: Any, picture: RenderOutput, camera: Camera) -> None:
-        cv2, scale = opencv(), camera.width / grey.shape[1]
-        alpha = picture.alpha[..., 0].detach().cpu().numpy()
-        cover = (cv2.resize(alpha, grey.shape[::-1], interpolation=cv2.INTER_AREA) > SOLID).astype(np.uint8)
-        around = (cv2.dilate(cover, np.ones((15, 15), np.uint8)) == 0).astype(np.uint8)
-        own, beside = (corners(grey, 600, 0.01, 4, mask) for mask in (cover, around))
-        self.start, self._count = np.concatenate([own, beside]), len(own)
-        self.full = len(beside) < LEAST_SHAKEN and cover.mean() > FULL
-        self.world, self.known = in_space(picture, camera, own * scale)
-        self._lens = camera.intrinsics.double().numpy() / np.array([[scale], [scale], [1.0]])
-
-    def far(self, place: Any, seen: Any, near: float) -> Any:
-        """How far points of the splat, of all (T, 2), have gone [pixels]; NaN if not known."""
-        found, used = np.full(self._count, np.nan), seen[: self._count] & self.known
-        there = place[: self._count][used]
-        if self.full:
-            off = off_camera(self.world[used], there, self._lens, near)
-            found[used] = np.nan if off is None else off
-        else:
-            turn = self.shake(place, seen)
-            found[used] = np.linalg.norm(there - self.start[: self._count][used] @ turn[:, :2].T - turn[:, 2], axis=-1)
-        return found
-
-    def shake(self, place: Any, seen: Any) -> Any:
-        around, turn = seen.copy(), None
-        around[: self._count] = False
-        if around.sum() >= LEAST_SHAKEN:
-            turn = opencv().estimateAffinePartial2D(self.start[around], place[around], ransacReprojThreshold=1.5)[0]
-        return np.eye(2, 3) if turn is None else turn
-
-
 def begins_to_move(film: Film, picture: RenderOutput, camera: Camera) -> float | None:
-    """Time of the first frame in which the object, not only the camera, has moved [s]; None if there is none."""
+    """Time of the first frame in which the object, not only the camera, has moved [s]; None if there is none.
+
+    Points around the splat tell how a hand shakes. If it fills the picture, most of its own points stand still.
+    """
     cv2: Any = opencv()
-    factor = max(1.0, max(film.size) / SMALL)
+    factor, in_a_row = max(1.0, max(film.size) / SMALL), 0
     small = scaled(*(round(side / factor) for side in film.size))
     with closing(frames_of(film.path, outputs=small, grey=True)) as frames:
         _, first = next(frames), next(frames)
-        shape = first.shape[::-1]
-        alpha = picture.alpha[..., 0].detach().cpu().numpy()
-        cover = cv2.resize(alpha, shape, interpolation=cv2.INTER_AREA) > 0.3
-        inside = cover if cover.any() else ~cover
-        points, in_a_row = Points(first, picture, camera), 0
+        shape, scale = first.shape[::-1], camera.width / first.shape[1]
+        alpha = cv2.resize(picture.alpha[..., 0].detach().cpu().numpy(), shape, interpolation=cv2.INTER_AREA)
+        cover, inside = (alpha > SOLID).astype(np.uint8), alpha > 0.3
+        around = (cv2.dilate(cover, np.ones((15, 15), np.uint8)) == 0).astype(np.uint8)
+        start = corners(first, 600, 0.01, 4, around)
+        full = len(start) < LEAST_SHAKEN and cover.mean() > FULL
+        if full:
+            start = corners(first, 600, 0.01, 4, cover)
+            world, known = in_space(picture, camera, start * scale)
+            lens = camera.intrinsics.double().numpy() / np.array([[scale], [scale], [1.0]])
         for number, grey in enumerate(frames, 1):
             moved = _differs(first, grey, inside)
             if moved:
-                (_, place), (_, seen) = follow(np.stack([first, grey]), points.start)
-                if points.full:
-                    far = points.far(place, seen, STRAY)
-                    moved = (far > STRAY).sum() >= max(LEAST_SHAKEN, MOVED_SHARE * np.isfinite(far).sum())
-                else:
-                    how = {"flags": cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
-                    moved = _differs(first, cv2.warpAffine(grey, points.shake(place, seen), shape, **how), inside)
+                (_, place), (_, seen) = follow(np.stack([first, grey]), start)
+            if moved and full:
+                used = seen & known
+                pose = pose_of(world[used], place[used], lens, STRAY) if used.sum() >= LEAST_SHAKEN else None
+                agree, far = (np.zeros(1), np.zeros(1)) if pose is None else (pose[0], pose[3])
+                least = max(LEAST_SHAKEN, MOVED_SHARE * used.sum())
+                moved = 2 * agree.sum() >= used.sum() and (far > STRAY).sum() >= least
+            elif moved and seen.sum() >= LEAST_SHAKEN:
+                turn = cv2.estimateAffinePartial2D(start[seen], place[seen], ransacReprojThreshold=1.5)[0]
+                how = {"flags": cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
+                moved = turn is None or _differs(first, cv2.warpAffine(grey, turn, shape, **how), inside)
             in_a_row = in_a_row + 1 if moved else 0
-            if in_a_row == (IN_A_ROW if points.full else 1):
+            if in_a_row == (IN_A_ROW if full else 1):
                 return (number + 1 - in_a_row) / film.fps
     return None
 
@@ -200,63 +166,6 @@ def _differs(first: Any, grey: Any, where: Any) -> bool:
     before, now = (picture[where].astype(float) for picture in (first, grey))
     level = now * (before.mean() / max(now.mean(), 1.0))
     return bool((abs(level - before) > DIFFERENT).mean() > MOVED_SHARE)
-
-
-def held_end(places: Tensor, moved: Tensor, up: Sequence[float]) -> tuple[str, float, float] | None:
-    """Find the end of an object that moves least in a film, from how far points (T, 3) of it go, (T,) [pixels].
-
-    Its name, and how far it and the liveliest quarter of the points go. None if no end is much more still than the
-    rest.
-    """
-    if len(moved) < 4 * FEWEST or (others := float(moved.quantile(0.75))) < LEAST_MOTION:
-        return None
-    upward = torch.nn.functional.normalize(torch.as_tensor(up, dtype=torch.float64), dim=0)
-    axes = {name: torch.tensor(axis, dtype=torch.float64) for name, axis in DIRECTIONS.items()}
-    ends = {name: axis for name, axis in axes.items() if abs(float(upward @ axis)) < 0.7}
-    ends |= {"top": upward, "bottom": -upward}
-    along = {name: places @ direction for name, direction in ends.items()}
-    length = {name: float(own.max() - own.min()) for name, own in along.items()}
-    found = []
-    for name, own in along.items():
-        there = own > own.max() - END * length[name]
-        if length[name] >= FLAT * max(length.values()) and int(there.sum()) >= FEWEST:
-            found.append((float(moved[there].median()), name))
-    if not found or min(found)[0] > STILL * others:
-        return None
-    moves, name = min(found)
-    return name, moves, others
-
-
-def moving_box(places: Tensor, moved: Tensor, cloud: GaussianCloud) -> tuple[Tensor, Tensor] | None:
-    """Corners (3,) of the box of what moves, and of all that is connected with it, from how far points (T, 3) go, (T,).
-
-    None if most of what is seen moves, or hardly anything.
-    """
-    goes = moved > max(LEAST_MOTION, LIVELY * float(moved.quantile(0.98))) if len(moved) else moved > 0
-    if not 4 * FEWEST <= int(goes.sum()) <= MOST * len(goes):
-        return None
-    low, high = (places[goes].quantile(share, dim=0) for share in (0.02, 0.98))
-    longest = float((high - low).max())
-    means = cloud.means.double()
-    points = means[((means > low - longest) & (means < high + longest)).all(-1) & (cloud.opacities > 0)]
-    part = connected_parts(points, max(longest / CELLS, 2 * particle_spacing(points)))
-    inside = ((points >= low) & (points <= high)).all(-1)
-    if not bool(inside.any()):
-        return None
-    own = points[part == int(part[inside].mode().values)]
-    return own.amin(0) - PAD * longest, own.amax(0) + PAD * longest
-
-
-def moving_points(video: Footage, picture: RenderOutput) -> tuple[Tensor, Tensor]:
-    """Places (T, 3) of a splat that are seen for half of a film, and how far each goes, without the hand [pixels]."""
-    cv2, images = opencv(), video.images.numpy()
-    points = Points(cv2.cvtColor(images[0], cv2.COLOR_RGB2GRAY), picture, video.cameras[0])
-    position, seen = follow(images, points.start)
-    gone, own = np.zeros(len(points.world)), seen[:, : len(points.world)]
-    for place, valid in zip(position[1:], seen[1:], strict=True):
-        gone = np.fmax(gone, points.far(place, valid, LEAST_MOTION))
-    kept = points.known & (own.mean(0) > 0.5)
-    return torch.from_numpy(points.world[kept]), torch.from_numpy(gone[kept])
 
 
 class Seen(NamedTuple):
@@ -289,7 +198,7 @@ def fit_film(
         splat: The splat that it shows.
         output: Folder: the camera, guesses and ``fit.yaml``; the results go to ``result`` in it.
         length: A known length, such as ``("pole", 2.4)``: of the object, a part, or between two places ``X,Y:X,Y`` in
-            the first frame [pixels], in metres; or ``gravity``, if the weight is to tell it.
+            the first frame [pixels], in metres.
         up: Direction in the splat that is up, an axis such as ``+z`` or (3,), instead of a guess.
         hold: End that is held, instead of a guess: ``top``, ``bottom``, ``none``, ``+x``, ... or ``-z``.
         focal: Focal length of the film, equivalent to 35 mm film [mm]; found if neither it nor the film says it.
@@ -343,16 +252,8 @@ def prepare(
     write_json(folder / CAMERAS, data)
     wanted: dict[str, Any] = {"up": axis, "hold": hold, "device": device, "quality": "draft"}
     preview = suggest(splat, **wanted)
-    shown, lines = _shown(seen, read_videos(folder / CAMERAS, origin=seen.cloud.origin)[0], preview, wanted)
-    wanted |= shown
-    preview = suggest(splat, **wanted) if shown else preview
-    if isinstance(length, tuple):
+    if length is not None:
         preview = suggest(splat, **wanted, longest_side=longest_side(*length, seen, preview))
-    if length == "gravity" and not preview.falls:
-        raise ValueError(
-            "`--length gravity` is for a sheet alone, or for what nothing holds: anything else was captured in balance "
-            "with its weight. Give a length that you know."
-        )
     write_starter(preview, folder / LOOK, 250)
     iio.imwrite(folder / LOOK / "preview.png", preview.picture())
     around = seen.picture.alpha[..., 0].cpu() < 0.05  # the colour that most of it has is the background
@@ -363,9 +264,8 @@ def prepare(
     write_text(folder / PLAN, text)
     say(f"{film} moves from {moves:.2f} s on; {begin:.2f} s to {begin + seconds:.2f} s of it are used")
     for name in ("up", "held", "parts", "size"):
-        lines += [f"{name}: {preview.reasons[name]}"] if name in preview.reasons else []
-    for line in lines:
-        say(line)
+        if name in preview.reasons:
+            say(f"{name}: {preview.reasons[name]}")
     if length is None:
         say("nobody measured the size: give --length, such as --length object 1.5")
     say(f"look at {folder / PICTURE}: frame and splat have to show the same; and at {folder / LOOK / 'preview.png'}")
@@ -392,44 +292,6 @@ def registered(
         f"{source} ({fov_of(found.camera):.0f} degrees from top to bottom)"
     )
     return Seen(head, cloud, found.camera, picture, found.residual), told
-
-
-def _shown(seen: Seen, video: Footage, preview: Suggestion, wanted: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    """Options of the preview that the film knows better than the splat, and sentences on them."""
-    shown: dict[str, Any] = {}
-    told: list[str] = []
-    up = preview.up.direction
-    if wanted["up"] is None and preview.up.confidence in ("low", "medium"):
-        upright = upright_in(seen.camera, up)
-        if upright is not None:
-            up = shown["up"] = tuple(upright)
-            told.append(f"up: {' '.join(f'{part:.4g}' for part in upright)}, as the film is upright")
-    if preview.parts is not None and not shown:
-        return {}, []
-    places, moved = moving_points(video, seen.picture)
-    box = moving_box(places, moved, seen.cloud)
-    if box is not None:
-        low, high = box
-        shown["region"] = [[round(value, 4) for value in corner.tolist()] for corner in box]
-        told.append("what moves in the film: from {} to {}".format(*shown["region"]))
-        inside = ((places >= low) & (places <= high)).all(-1)
-        places, moved = places[inside], moved[inside]
-    held = None if wanted["hold"] is not None else held_end(places, moved, up)
-    if held is not None:
-        shown["hold"], own, others = held
-        told.append(
-            f"held: {shown['hold']}, as the film shows; that end moves by {own:.1f} pixels, the rest by {others:.0f}"
-        )
-    return shown, told
-
-
-def upright_in(camera: Camera, guess: Sequence[float]) -> list[float] | None:
-    """The direction of a splat, an axis if one is near, that is up in a film; None if a guess (3,) is, too."""
-    up = (-camera.world_to_camera[1, :3]).numpy(force=True).astype(float)
-    if up @ guess > UPRIGHT:
-        return None
-    best = max(DIRECTIONS.values(), key=lambda axis: float(up @ axis))
-    return list(best) if up @ best > NEARLY else up.tolist()
 
 
 def longest_side(name: str, metres: float, seen: Seen, preview: Suggestion) -> float:
@@ -488,8 +350,6 @@ def plan_text(
         "wind.azimuth": (round(middle - half), round(middle + half)),
         "material.E": [float(f"{preview.youngs_modulus * factor:.1e}") for factor in (SOFTER, STIFFER)],
     }
-    if length == "gravity":
-        ranges[SCALE] = [float(f"{preview.metres_per_unit * factor:.2g}") for factor in (SHORTER, LONGER)]
     ranges[FILM_START] = (-1.0, 0.1) if still is None else (0.0, round(still + 0.1, 2))
     plan = {
         "base": f"{LOOK}/starter.yaml",

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gaussian_swaying.inverse.registration import LEAST, SOLID, Registration, grey_of, refine
+from gaussian_swaying.inverse.registration import LEAST, SOLID, Registration, by_flow, grey_of
 from gaussian_swaying.inverse.tracks import STILL, corners, follow, opencv
 from gaussian_swaying.inverse.videos import Footage
 from gaussian_swaying.rendering.cameras.camera import Camera
@@ -99,7 +99,7 @@ def follow_camera(
         seen = None
         for _ in range(DRAWN if found else FIRST):
             picture, still = background.draw(camera)
-            seen = refine(image, picture, camera, still)
+            seen = by_flow(grey_of(image), picture, camera, where=still)
             if seen is None or seen.agreeing < AGREE * seen.matches:
                 seen = None
                 break

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,21 +15,17 @@ from torch import Tensor
 
 from gaussian_swaying._arguments import check_arguments, is_number
 from gaussian_swaying._checks import check_choice, check_whole
-from gaussian_swaying._fixed import changed
 from gaussian_swaying._live import Live
 from gaussian_swaying._yaml_limits import read_fields
 from gaussian_swaying.config.gone import refuse_gone
 from gaussian_swaying.config.parser import import_forces
 from gaussian_swaying.simulation.model import Model, find, names
-from gaussian_swaying.wind.field import WindField
 
 Values = Mapping[str, float]  # values of the unknowns, by name
-SCALES = ("log", "linear")
-SCALE, FILM_START = "scene.metres_per_unit", "film.start"  # start of the motion [s]; below 0, the wind has blown before
+FILM_START = "film.start"  # an unknown: start of the motion [s]; below 0, the wind has blown before
 FLAT = 0.8  # mean square of the area that faces one way, from which the wind may be mirrored
 TURN = 5.0  # least angle between wind and mirror image [degrees]
 LARGE = 0.25  # share of the largest part of a direction below which an unknown is not named
-OF_FILM = {FILM_START: Live("s"), SCALE: Live("m", scale="log")}  # unknowns that are no numbers of the simulation
 LISTS = ("base", "videos", "cameras", "assumed", "also_moves")
 ASSUMED = ("length", "mass", "camera")
 
@@ -40,7 +36,7 @@ class Unknown:
 
     Args:
         name: A number of :class:`~gaussian_swaying.simulation.model.Model`, such as ``material.E`` or ``wind.speed``,
-            or one of :data:`OF_FILM`.
+            or ``film.start``.
         scale: ``log`` or ``linear``.
         start: First value; None for a coarse search over the range.
 
@@ -56,25 +52,19 @@ class Unknown:
 
     def __post_init__(self) -> None:
         where = f"unknowns.{self.name}"
-        check_choice(f"{where}.scale", self.scale, SCALES)
-        known = known_unknown(self.name)
-        if known is None or known.kind != "number":
-            possible = {n: known_unknown(n.replace("*", "0")) for n in (*OF_FILM, *names())}
-            sought = [n for n, one in possible.items() if one and one.kind == "number"]
-            raise ValueError(f"`{self.name}` cannot be sought: use {', '.join(sought)}, or put it into `known`.")
-        if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
+        check_choice(f"{where}.scale", self.scale, ("log", "linear"))
+        for end in (self.low, self.high):
+            number_of(self.name).check(f"{where}.range", end)
+        if not self.low < self.high:
             raise ValueError(f"Expected `{where}.range` to be [low, high], but got [{self.low}, {self.high}].")
         if self.scale == "log" and self.low <= 0:
             raise ValueError(f"Expected `{where}.range` above 0 with `scale: log`, but got {self.low}.")
-        for end in (self.low, self.high):
-            known.check(f"{where}.range", end)
         if self.start is not None and not self.low <= self.start <= self.high:
             raise ValueError(f"Expected `{where}.start` within its range, but got {self.start}.")
 
     @property
     def unit(self) -> str:
-        known = known_unknown(self.name)
-        return known.unit if known else ""
+        return number_of(self.name).unit
 
     def value(self, share: float) -> float:
         """The value at a share of the range, 0 at ``low`` and 1 at ``high``."""
@@ -93,9 +83,13 @@ class Unknown:
         return self.value(share) * math.log(self.high / self.low) if self.scale == "log" else self.high - self.low
 
 
-def known_unknown(name: str) -> Live | None:
-    """The number of an unknown; None if there is none."""
-    return OF_FILM.get(name) or find(name)
+def number_of(name: str) -> Live:
+    """The number that an unknown is; ValueError if it cannot be sought."""
+    known = Live("s") if name == FILM_START else find(name)
+    if known is None or known.kind != "number":
+        sought = [n for n in names() if (one := find(n.replace("*", "0"))) and one.kind == "number"]
+        raise ValueError(f"`{name}` cannot be sought: use {', '.join([FILM_START, *sought])}, or put it into `known`.")
+    return known
 
 
 def values_at(unknowns: Sequence[Unknown], place: Iterable[float]) -> dict[str, float]:
@@ -105,39 +99,7 @@ def values_at(unknowns: Sequence[Unknown], place: Iterable[float]) -> dict[str, 
 
 def of_simulation(values: Values) -> dict[str, float]:
     """The values that are numbers of the simulation."""
-    return {name: value for name, value in values.items() if name not in OF_FILM}
-
-
-def model_of(model: Model, values: Values) -> Model:
-    """The model of a variant, at another scale if its values say so."""
-    found = model.at(of_simulation(values))
-    return at_scale(found, values[SCALE]) if SCALE in values else found
-
-
-def at_scale(model: Model, metres_per_unit: float) -> Model:
-    """A model, whose values are meant in metres, that moves as if a scene unit had another length [m]."""
-    wind, scene = model.wind, model.scene
-    gravity, sheet = model.value("solver.gravity"), not scene.filled
-    single = model.material.volume == "patch" and model.points.count == scene.on_surface + scene.filled
-    bending = model.points.bending
-    single &= bending is None or not (isinstance(model.material.bending, str) or model.material.regions)
-    single &= any(gravity) and not (model.air or model.forces)
-    if not (single and isinstance(wind, WindField)) or len(wind.modulations) or len(wind.effects):
-        raise ValueError(
-            f"`{SCALE}` can be sought only under `solver.gravity`, in a plain wind (no `wind.modulations`, "
-            "`wind.effects`, `air` and `forces`), with `material.volume: patch`, `scene.layers: 1` and no or one "
-            "`material.bending` in N m: set them, or measure a length."
-        )
-    ratio = metres_per_unit / scene.frame.metres_per_unit
-    changes = {"material.E": model.value("material.E") / ratio ** (3 if sheet else 2)}
-    if sheet:
-        changes["material.density"] = model.value("material.density") / ratio
-    found = model.at(changes | {"solver.gravity": [part / ratio for part in gravity]})
-    if bending is not None:
-        found = found.replace(points=replace(found.points, bending=bending / ratio**5))
-    if model.aero.added_mass:
-        found = replace(found, aero=changed(model.aero, added_mass=model.aero.added_mass / ratio))
-    return replace(found, wind=changed(wind, flows=wind.flows / ratio))
+    return {name: value for name, value in values.items() if name != FILM_START}
 
 
 def check_apart(matrix: Tensor, unknowns: Sequence[Unknown], place: Tensor, limit: float) -> None:
@@ -175,8 +137,7 @@ def apart_by(unknowns: Sequence[Unknown], one: Sequence[float], other: Sequence[
     most = 0.0
     for unknown, a, b in zip(unknowns, one, other, strict=True):
         wide = unknown.high - unknown.low
-        turned = unknown.name == "wind.azimuth"
-        most = max(most, abs(turn(wide * (a - b))) / wide if turned else abs(a - b))
+        most = max(most, abs(turn(wide * (a - b))) / wide if unknown.name == "wind.azimuth" else abs(a - b))
     return most
 
 
@@ -295,6 +256,5 @@ def read_unknown(name: str, given: Any) -> Unknown:
             f"got {given!r:.60}."
         )
     low, high, *begin = map(float, numbers)
-    known = known_unknown(str(name))
-    scale = str(scale or ("log" if low > 0 and known and known.scale == "log" else "linear"))
+    scale = str(scale or ("log" if low > 0 and number_of(str(name)).scale == "log" else "linear"))
     return Unknown(str(name), low, high, scale, *begin)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -129,20 +130,8 @@ def find_camera(draw: Draw, frame: Tensor, start: Sequence[Camera], *, focal: bo
     for _ in range(ROUNDS):
         best = _by_features(sift, wanted, draw(best.camera), best.camera, focal) or best
     for _ in range(ROUNDS if best.agreeing < ENOUGH else 0):
-        best = _by_flow(grey, draw(best.camera), best.camera, focal) or best
+        best = by_flow(grey, draw(best.camera), best.camera, focal, CLOSE) or best
     return best
-
-
-def refine(frame: Tensor, picture: RenderOutput, camera: Camera, where: Tensor) -> Registration | None:
-    """The camera of a frame from a picture from nearby, of whose pixels ``where`` (H, W) count; None if too few agree.
-
-    Most points may have moved by some 20 pixels.
-    """
-    return _by_flow(grey_of(frame), picture, camera, False, _near(camera), where)
-
-
-def _near(camera: Camera) -> float:
-    return NEAR * math.hypot(camera.width, camera.height)
 
 
 def grey_of(image: Tensor) -> Any:
@@ -166,16 +155,11 @@ def in_space(picture: RenderOutput, camera: Camera, pixel: Any) -> tuple[Any, An
     return (z[:, None] * ray - view[:3, 3]) @ view[:3, :3], known
 
 
-def off_camera(world: Any, there: Any, intrinsics: Any, near: float) -> Any:
-    """Distances of points (T, 3) from where the camera sees them that agrees with most of their places (T, 2) [pixels].
+def pose_of(world: Any, there: Any, K: Any, near: float) -> tuple[Any, Any, Any, Any] | None:
+    """The camera that sees points (T, 3) where most of their places (T, 2) are [pixels]; None if too few agree.
 
-    Points agree that are nearer than ``near`` [pixels]. Shape (T,); None if less than half of them agree on a camera.
+    A mask of the points that agree, by less than ``near`` [pixels], rotation, shift, and distances of all [pixels].
     """
-    found = _pose(world, there, intrinsics, near) if len(world) >= 8 else None
-    return None if found is None or 2 * int(found[0].sum()) < len(world) else found[3]
-
-
-def _pose(world: Any, there: Any, K: Any, near: float) -> tuple[Any, Any, Any, Any] | None:
     cv2, how = opencv(), {"iterationsCount": 2000, "confidence": 0.9999, "flags": opencv().SOLVEPNP_AP3P}
     done, turn, shift, agree = cv2.solvePnPRansac(world, there, K, None, reprojectionError=near, **how)
     if not done:
@@ -203,12 +187,21 @@ def _by_features(
         return None
     here = np.array([points[one.queryIdx].pt for one in good]) + 0.5  # OpenCV counts from the centre of a pixel
     there = np.array([wanted[0][one.trainIdx].pt for one in good]) + 0.5
-    return _seen_from(picture, camera, here, there, focal, _near(camera))
+    return _seen_from(picture, camera, here, there, focal)
 
 
-def _by_flow(
-    grey: Any, picture: RenderOutput, camera: Camera, focal: bool, near: float = CLOSE, where: Tensor | None = None
+def by_flow(
+    grey: Any,
+    picture: RenderOutput,
+    camera: Camera,
+    focal: bool = False,
+    near: float = 0.0,
+    where: Tensor | None = None,
 ) -> Registration | None:
+    """The camera of a frame, as :func:`grey_of` has it, from a picture from nearby; None if too few points agree.
+
+    Most points may have moved by some 20 pixels. Only pixels ``where`` (H, W) count; ``near`` 0 is what is usual.
+    """
     cv2, drawn = opencv(), grey_of(picture.color)
     solid = picture.alpha[..., 0].detach().cpu().numpy() > SOLID
     solid = solid if where is None else solid & where.numpy()
@@ -221,13 +214,17 @@ def _by_flow(
 
 
 def _seen_from(
-    picture: RenderOutput, camera: Camera, here: Any, there: Any, focal: bool, near: float
+    picture: RenderOutput, camera: Camera, here: Any, there: Any, focal: bool, near: float = 0.0
 ) -> Registration | None:
     """The camera that sees what the picture shows at ``here`` at ``there``; None if too few pairs agree."""
     cv2, K = opencv(), camera.intrinsics.double().cpu().numpy()
     world, known = in_space(picture, camera, here)
     world, there = world[known], np.ascontiguousarray(there[known], dtype=np.float64)
-    pose = _pose(world, there, K, near) if len(world) >= LEAST else None
+    pose = (
+        pose_of(world, there, K, near or NEAR * math.hypot(camera.width, camera.height))
+        if len(world) >= LEAST
+        else None
+    )
     if pose is None or pose[0].sum() < LEAST:
         return None
     agree, turn, shift, _ = pose
@@ -277,7 +274,12 @@ def first_look(simulation: Simulation, video: Footage, earliest: float | None) -
         return picture_of(simulation, rest, camera.to(dtype=torch.float32))
 
     share, off, most = shown_in(draw(given), frame)
-    other = None if share >= FOUND and off <= AWAY else _elsewhere(draw, frame, given, share)
+    other = None
+    if share < FOUND or off > AWAY:
+        with suppress(ValueError):  # it is not found from another camera either
+            found = find_camera(draw, frame, [given]).camera
+            better, left, _ = shown_in(draw(found), frame)
+            other = found if better >= max(FOUND, share) and left < 0.5 * AWAY else None
     if other is None and share < FOUND and (earliest is None or earliest >= 0):
         raise ValueError(
             f"The first frame of camera {video.name} does not show the splat where its camera looks: give a film of "
@@ -302,13 +304,3 @@ def first_look(simulation: Simulation, video: Footage, earliest: float | None) -
         "from where its `transform_matrix` says: its places are in another unit than the splat, or it is another "
         "camera. Find it with `gaussian-swaying camera FILM SPLAT`."
     ]
-
-
-def _elsewhere(draw: Draw, frame: Tensor, given: Camera, share: float) -> Camera | None:
-    """Another camera, from which more than a share of the splat's points are alike in a frame; None if none is."""
-    try:
-        found = find_camera(draw, frame, [given]).camera
-    except ValueError:
-        return None
-    better, off, _ = shown_in(draw(found), frame)
-    return found if better >= max(FOUND, share) and off < 0.5 * AWAY else None

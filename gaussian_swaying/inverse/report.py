@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gaussian_swaying._files import write_json, write_table, write_text
 from gaussian_swaying.config.parser import config_text
-from gaussian_swaying.inverse.plan import SCALE, Unknown, Values, of_simulation, values_at
+from gaussian_swaying.inverse.plan import Unknown, Values, of_simulation, values_at
 from gaussian_swaying.inverse.tracks import Tracks, opencv, picture_of
 from gaussian_swaying.inverse.variants import states_of
 from gaussian_swaying.recording.video import VideoEncoder
@@ -207,12 +207,6 @@ def scene_text(values: Mapping[str, float], parser: ArgumentParser, settings: Na
     if any(name in values for name in POLAR):
         found.wind.flow = flow_of(simulation.wind.flows[0].tolist(), values)  # type: ignore[index]
     in_settings(found, {name: value for name, value in of_simulation(values).items() if name not in POLAR})
-    if SCALE in values:  # cells and spacings are in metres
-        ratio = values[SCALE] / simulation.scene.frame.metres_per_unit
-        found.scene.metres_per_unit, found.scene.longest_side = values[SCALE], None
-        found.solver.dx = ratio * float(simulation.solver.dx)
-        if found.scene.filling and found.scene.filling.spacing:
-            found.scene.filling.spacing *= ratio
     told = "".join(f"# {name}: {value:.6g}\n" for name, value in values.items())
     return "# Found by gaussian-swaying fit:\n" + told + f"frames: {settings.frames}\n" + config_text(parser, found)
 

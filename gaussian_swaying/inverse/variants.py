@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gaussian_swaying._fixed import assign
 from gaussian_swaying.inverse.least_squares import Block
-from gaussian_swaying.inverse.plan import FILM_START, OF_FILM, Unknown, Values, model_of
+from gaussian_swaying.inverse.plan import FILM_START, Unknown, Values, of_simulation
 from gaussian_swaying.inverse.tracks import Tracks
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.rendering.cameras.camera import project
@@ -50,7 +50,7 @@ def check_variants(simulation: Simulation, unknowns: Sequence[Unknown]) -> None:
         why = "it has `copies`, and a video shows one object; remove them"
     if why is not None:
         raise ValueError(f"The base cannot be fitted through: {why}.")
-    model_of(simulation.model, {unknown.name: unknown.value(0.5) for unknown in unknowns})
+    simulation.model.at(of_simulation({unknown.name: unknown.value(0.5) for unknown in unknowns}))
 
 
 @torch.no_grad()
@@ -81,10 +81,10 @@ def states_of(
 
 
 def _groups(simulation: Simulation, values: Sequence[Values], alike: bool) -> list[_Group]:
-    models = [model_of(simulation.model, own) for own in values]
+    models = [simulation.model.at(of_simulation(own)) for own in values]
     shared: dict[tuple[object, ...], list[int]] = {}
     for index, (own, model) in enumerate(zip(values, models, strict=True)):
-        apart = [pair for pair in sorted(own.items()) if pair[0] in OF_FILM or not number(pair[0]).batched]
+        apart = [pair for pair in sorted(own.items()) if pair[0] == FILM_START or not number(pair[0]).batched]
         shared.setdefault((*apart, 0 if alike else _stiffness_class(model)), []).append(index)
     found = []
     for members in shared.values():
@@ -146,7 +146,7 @@ def compare(
         for time in times:
             _, what = wanted.setdefault(round(max(0.0, time - start), 6), (max(0.0, time - start), []))
             what += [(k, time)] if time > 0 or moving else []  # at rest all variants are alike
-    own = [{name: v for name, v in one.items() if name != FILM_START} for one in values] if starts else values
+    own = list(map(of_simulation, values)) if starts else values
     moments = [wanted[key] for key in sorted(wanted)]
 
     def compared(alike: bool) -> list[Block]:

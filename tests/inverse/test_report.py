@@ -6,13 +6,15 @@ from dataclasses import replace
 
 import pytest
 import torch
-from shared import double
+from shared import double, peak
 from small_films import changed
 
 from gaussian_swaying.inverse.fit import STEPS, UNSETTLED, run_fit
 from gaussian_swaying.inverse.least_squares import Block, solve
 from gaussian_swaying.inverse.plan import Unknown
-from gaussian_swaying.inverse.report import Fit, consequences
+from gaussian_swaying.inverse.report import Fit, consequences, scene_text
+from gaussian_swaying.inverse.variants import states_of
+from gaussian_swaying.simulation.simulation import Simulation
 
 from .test_least_squares import scaled
 
@@ -100,3 +102,22 @@ def test_what_follows_from_what_was_not_measured(simulation, tmp_path):
     assert "Gravity" not in consequences(["length"], {}, changed(tmp_path, solver={"gravity": [0.0, 0.0, 0.0]}))[0]
     assert math.isclose(size, 0.4, abs_tol=0.15)
     assert consequences([], {"wind.speed": 5.0}, simulation) == []
+
+
+SCHEDULE = [{"time": 0.0, "flow": [4.0, 3.0, 0.0]}, {"time": 0.3, "flow": [1.0, 0.0, 0.0]}]
+
+
+@pytest.mark.parametrize(
+    "changes", [{}, {"wind": {"flow": None, "schedule": SCHEDULE}}, {"material": {"bending": 0.02}}]
+)
+def test_the_configuration_that_is_written_moves_as_the_fit(tmp_path, changes):
+    simulation, parser, values = changed(tmp_path, **changes), Simulation.parser(), {"material.E": 2e4}
+    values |= {} if "wind" in changes else {"wind.speed": 4.0, "wind.azimuth": 20.0}
+    settings = parser.parse_args(["--config", str(tmp_path / "made.yaml")])
+    (tmp_path / "scene.yaml").write_text(scene_text(values, parser, settings, simulation))
+    written = Simulation.from_yaml(tmp_path / "scene.yaml", device="cpu")
+    (found,), (wanted,) = (
+        list(states_of(one, [own], [0.0, 0.3]))[-1] for one, own in ((written, {}), (simulation, values))
+    )
+    assert peak(wanted.position - simulation.model.points.position) > 0.01
+    torch.testing.assert_close(found.position, wanted.position, rtol=1e-3, atol=1e-5)
