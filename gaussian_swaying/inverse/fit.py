@@ -23,28 +23,9 @@ from tqdm import tqdm
 from gaussian_swaying._files import write_json
 from gaussian_swaying._inputs import read_json
 from gaussian_swaying.config.parser import check_settings, option
-from gaussian_swaying.inverse.hand import prepared
-from gaussian_swaying.inverse.least_squares import (
-    DivergedError,
-    Residuals,
-    Solved,
-    cost_of,
-    covariance,
-    linearised,
-    solve,
-)
-from gaussian_swaying.inverse.plan import (
-    FILM_START,
-    Plan,
-    apart_by,
-    check_apart,
-    make_plan,
-    mirrored_place,
-    of_simulation,
-    turn,
-    values_at,
-)
-from gaussian_swaying.inverse.registration import first_look
+from gaussian_swaying.inverse.least_squares import DivergedError, Residuals, Solved, cost_of, covariance, normal, solve
+from gaussian_swaying.inverse.plan import FILM_START, Plan, apart_by, check_apart, make_plan, mirror_of, turn, values_at
+from gaussian_swaying.inverse.registration import first_look, prepared
 from gaussian_swaying.inverse.report import PICTURES, Fit, consequences, write_before, write_films, write_results
 from gaussian_swaying.inverse.tracks import Tracks, match, opencv, track
 from gaussian_swaying.inverse.variants import check_variants, compare, explained, split, states_of, trusted
@@ -59,9 +40,7 @@ if TYPE_CHECKING:
 
 PROGRESS, FORMAT = "fit.json", 2
 OURS = (PROGRESS, "page.html", "values.csv", "result.json", "scene.yaml", PICTURES)
-
 UNSETTLED = "The values have not settled: `iterations` ran out: raise it and continue with --resume."
-
 FOLLOWED = 0.5  # share of the frames in which points are followed; chaos grows with time
 STEPS = (0.5, 0.5, 0.75, 1.0, 1.0)  # shares in which Gaussians are matched from rendered frames
 STARTS, SEARCHED, COARSE = 3, 0.5, 0.02  # starts, share of the frames, and residuals per picture, of the search
@@ -145,10 +124,7 @@ class Problem:
             shown = self.simulation.painter.deformed(self._states(self.first, [0.0])[0]) if self.first else None
             self._tracks = [track(self.simulation, video, self.plan.tracks, shown) for video in self.videos]
             if sum(len(own.index) for own in self._tracks) < 4:
-                raise ValueError(
-                    "Fewer than four points of the object can be followed: give sharper videos of something that has "
-                    "texture."
-                )
+                raise ValueError("Fewer than four points can be followed: give sharper videos of something textured.")
         return self._tracks
 
     def begin_at(self, first: Sequence[float]) -> None:
@@ -162,7 +138,7 @@ class Problem:
         assert known is not None
         before = torch.linspace(max(0.0, -known.high), -known.low, BEGINS, dtype=torch.float64).tolist()
         brief = [replace(video, images=video.images[:1]) for video in self.videos]
-        values = [of_simulation(self.values(place)) for place in places]
+        values = [self.values(place) | {FILM_START: 0.0} for place in places]
         found: list[tuple[int, list[float]]] = []
         with self.say.work("where the film begins", len(before) * len(places)):
             for ago, states in zip(before, states_of(self.simulation, values, before, alike=False), strict=True):
@@ -280,7 +256,7 @@ class Problem:
 
     def others(self, place: Sequence[float], rivals: Sequence[Sequence[float]]) -> list[dict[str, float]]:
         """Values of other ends, of other starts and the mirrored wind, that cost about as little over all frames."""
-        unknowns, other = self.plan.unknowns, mirrored_place(self.simulation.model, self.plan.unknowns, place)
+        unknowns, other = self.plan.unknowns, mirror_of(self.simulation.model, self.plan.unknowns, place)
         tried, near = [list(place), *map(list, rivals), *other], []
         if len(tried) == 1:
             return []
@@ -336,41 +312,36 @@ class Problem:
             place, *rivals = self.best_of(course["starts"])
             self.say(f"search: {self._shown(place)}")
             at = torch.tensor(place, dtype=torch.float64)
-            matrix, _ = linearised(self.residuals(self.evidence(), self.fitted), at)
+            matrix, _ = normal(self.residuals(self.evidence(), self.fitted), at)
             check_apart(matrix, self.plan.unknowns, at, self.plan.limit)
             kept(places=[place], rivals=rivals, history=[])
-        result = self.result(course, self._stepped(course["places"], course["history"], kept), folder)
-        return replace(result, seconds=time.monotonic() - clock)
-
-    def _stepped(
-        self, places: list[list[float]], history: list[dict[str, Any]], kept: Callable[[], None]
-    ) -> list[Tracks]:
-        last = len(STEPS) - 1
+        places, history, last = course["places"], course["history"], len(STEPS) - 1
         while True:
             number = min(len(history), last)
             times, matched = self._until(STEPS[number]), places[number]
             evidence = self.trusted(self.evidence(matched), matched)
             left = self.plan.iterations - sum(row["steps"] for row in history[last:]) // TRIES
             if left <= 0 or (history[last:] and history[-1]["ended"]):  # it is continued after its end
-                return evidence
+                break
             found = self.solved(places[-1], evidence, times, left, number == last)
             places.append(found.place.tolist())
-            row = {"until": times[-1], "steps": found.steps, "cost": found.cost, "ended": found.ended}
+            cost = float(cost_of(found.block, found.scale)[0])
+            row = {"until": times[-1], "steps": found.steps, "cost": cost, "ended": found.ended}
             history.append(row | {"pixels": found.scale} | self.values(places[-1]))
             self.say(f"matches to {times[-1]:.3g} s, {found.steps} steps: {self._shown(places[-1])}")
             kept()
             if number == last:
-                return evidence
+                break
+        return replace(self.result(course, evidence, folder), seconds=time.monotonic() - clock)
 
     def result(self, course: Mapping[str, Any], evidence: Sequence[Tracks], folder: Path | None) -> Fit:
         at = course["places"][-1]
         place, held = torch.tensor(at, dtype=torch.float64), [split(own)[1] for own in self.tracks]
         values = self.values(at)
-        normal = linearised(self.residuals(evidence, self.fitted), place)
         return Fit(
             self.plan.unknowns,
             tuple(at),
-            covariance(*normal) + self.grid_covariance(place, evidence),
+            covariance(*normal(self.residuals(evidence, self.fitted), place)) + self.grid_covariance(place, evidence),
             course["history"],
             course["seconds"],
             "" if course["history"][-1]["ended"] else UNSETTLED,
@@ -441,7 +412,15 @@ def run_fit(
     needed = [*in_use, *(Path(path) for path in (*plan.base, *plan.videos, settings.scene.ply) if path)]
     lock = hold_folder(folder, remedy) if resume else claim_folder(folder, OURS, remedy, needed)
     try:
-        course = _read_course(folder, described) if resume else {}
+        course: dict[str, Any] = {}
+        if resume:
+            kept = read_json(folder / PROGRESS, "progress of the fit")
+            if not isinstance(kept, dict) or kept.get("format") != FORMAT:
+                raise ValueError(f"{folder / PROGRESS} is of another version: leave out --resume to begin again.")
+            for name, value in described.items():
+                if kept["plan"].get(name) != value:
+                    raise ValueError(f"The fit in {folder} has another `{name}`: leave out --resume to begin again.")
+            course = kept["course"]
 
         def keep() -> None:
             write_json(folder / PROGRESS, {"format": FORMAT, "plan": described, "course": course})
@@ -532,15 +511,3 @@ def fit(
     """
     plan = make_plan({"base": base, "videos": videos, "unknowns": unknowns, **settings}, "a fit")
     return run_fit(plan, output, resume=resume, device=device, progress=progress)
-
-
-def _read_course(folder: Path, described: Mapping[str, Any]) -> dict[str, Any]:
-    kept = read_json(folder / PROGRESS, "progress of the fit")
-    if not isinstance(kept, dict) or kept.get("format") != FORMAT:
-        raise ValueError(
-            f"{folder / PROGRESS} is of another version of the program: leave out --resume to begin again."
-        )
-    for name, value in described.items():
-        if kept["plan"].get(name) != value:
-            raise ValueError(f"The fit in {folder} has another `{name}`: leave out --resume to begin again.")
-    return dict(kept["course"])

@@ -9,11 +9,13 @@ import subprocess
 from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
+import yaml
 from torch import Tensor
 
 from gaussian_swaying import _program as program
@@ -168,16 +170,6 @@ def _differs(first: Any, grey: Any, where: Any) -> bool:
     return bool((abs(level - before) > DIFFERENT).mean() > MOVED_SHARE)
 
 
-class Seen(NamedTuple):
-    """A film, the splat, the camera of the first frame with its residual [pixels], and the splat's picture there."""
-
-    film: Film
-    cloud: GaussianCloud
-    camera: Camera
-    picture: RenderOutput
-    residual: float
-
-
 @checked
 def fit_film(
     film: str | os.PathLike[str],
@@ -228,36 +220,49 @@ def prepare(
     if Path(film).suffix.lower() in STILLS:
         raise ValueError(f"{film} is a picture: give a film, or find its camera with `camera`.")
     axis, folder = None if up is None else given_up(up).direction, Path(output)
-    seen, told = registered(film, splat, axis, focal)
-    say(told)
+    head, cloud, found = open_film(os.fspath(film)), read_gaussians(splat, 0), None
+    known = focal or head.focal
+    fov = None if known is None else view_of_focal(known, *head.size)
+    with suppress(ValueError):
+        found, picture = register(head.first, cloud, axis, fov)
+    if found is None or shown_in(picture, head.first)[0] < FOUND:
+        raise ValueError(
+            f"The splat was not found in the first frame of {film}. It has to show the object at rest, large "
+            "and with texture, from a side that was captured; `--up` and `--focal` help."
+        )
+    source = "found" if known is None else f"of {known:g} mm" + ("" if focal else ", as the film says")
+    say(
+        f"camera: {found.agreeing} of {found.matches} points agree, {found.residual:.1f} pixels off; focal length "
+        f"{source} ({fov_of(found.camera):.0f} degrees from top to bottom)"
+    )
     folder.mkdir(parents=True, exist_ok=True)
-    iio.imwrite(folder / PICTURE, side_by_side(seen.film.first, seen.picture))
-    moves = begins_to_move(seen.film, seen.picture, seen.camera)
+    iio.imwrite(folder / PICTURE, side_by_side(head.first, picture))
+    moves = begins_to_move(head, picture, found.camera)
     if moves is None:
         raise ValueError(
             f"Nothing moves in the film {film} where the splat is: look at {folder / PICTURE}, and give a film "
             "in which the wind moves it."
         )
-    at_once = moves < 1.5 / seen.film.fps
-    if at_once and seen.residual > ROUGH * math.hypot(*seen.film.size):
+    at_once = moves < 1.5 / head.fps
+    if at_once and found.residual > ROUGH * math.hypot(*head.size):
         raise ValueError(
-            f"The film {film} begins in motion, and its camera was found to {seen.residual:.1f} pixels only: "
+            f"The film {film} begins in motion, and its camera was found to {found.residual:.1f} pixels only: "
             "cut it so that it begins with the object at rest, or write a fit file with a camera that you know."
         )
     begin = max(0.0, moves - LEAD)
-    seconds = min(1.5 * SECONDS + moves - begin, seen.film.seconds - begin)
-    where = os.path.relpath(seen.film.path.resolve(), folder.resolve())
-    data = transforms(seen.camera, where, seen.cloud.origin)
+    seconds = min(1.5 * SECONDS + moves - begin, head.seconds - begin)
+    where = os.path.relpath(head.path.resolve(), folder.resolve())
+    data = transforms(found.camera, where, cloud.origin)
     data["frames"][0] |= {"begin": round(begin, 4), "seconds": round(seconds, 4)}
     write_json(folder / CAMERAS, data)
-    wanted: dict[str, Any] = {"up": axis, "hold": hold, "device": device, "quality": "draft"}
-    preview = suggest(splat, **wanted)
+    guess = partial(suggest, splat, up=axis, hold=hold, device=device, quality="draft")
+    preview = guess()
     if length is not None:
-        preview = suggest(splat, **wanted, longest_side=longest_side(*length, seen, preview))
+        preview = guess(longest_side=longest_side(*length, cloud, found.camera, picture, head.full, preview))
     write_starter(preview, folder / LOOK, 250)
     iio.imwrite(folder / LOOK / "preview.png", preview.picture())
-    around = seen.picture.alpha[..., 0].cpu() < 0.05  # the colour that most of it has is the background
-    pixels = seen.film.first[around] if bool(around.any()) else seen.film.first.flatten(0, 1)
+    around = picture.alpha[..., 0].cpu() < 0.05  # the colour that most of it has is the background
+    pixels = head.first[around] if bool(around.any()) else head.first.flatten(0, 1)
     colour = [round(value / 255, 3) for value in pixels.median(0).values.tolist()]
     text = plan_text(preview, colour, None if at_once else moves - begin, length, folder)
     keep_aside(folder / PLAN, text)
@@ -272,47 +277,38 @@ def prepare(
     return folder / PLAN
 
 
-def registered(
-    film: str | os.PathLike[str], splat: str | os.PathLike[str], up: Sequence[float] | None, focal: float | None
-) -> tuple[Seen, str]:
-    """The first frame of a film with its camera, and a sentence on that."""
-    head, cloud = open_film(os.fspath(film)), read_gaussians(splat, 0)
-    known, found = focal or head.focal, None
-    fov = None if known is None else view_of_focal(known, *head.size)
-    with suppress(ValueError):
-        found, picture = register(head.first, cloud, up, fov)
-    if found is None or shown_in(picture, head.first)[0] < FOUND:
-        raise ValueError(
-            f"The splat was not found in the first frame of {film}. It has to show the object at rest, large "
-            "and with texture, from a side that was captured; `--up` and `--focal` help."
-        )
-    source = "found" if known is None else f"of {known:g} mm" + ("" if focal else ", as the film says")
-    told = (
-        f"camera: {found.agreeing} of {found.matches} points agree, {found.residual:.1f} pixels off; focal length "
-        f"{source} ({fov_of(found.camera):.0f} degrees from top to bottom)"
-    )
-    return Seen(head, cloud, found.camera, picture, found.residual), told
-
-
-def longest_side(name: str, metres: float, seen: Seen, preview: Suggestion) -> float:
+def longest_side(
+    name: str, metres: float, cloud: GaussianCloud, camera: Camera, picture: RenderOutput, full: float,
+    preview: Suggestion,
+) -> float:  # fmt: skip
     """The longest side [m] with which ``object``, a part, or two places X,Y:X,Y in the first frame have that length.
 
-    That of the preview is 1 m.
+    That of the preview is 1 m. The film itself is ``full`` times as large as the picture of the splat.
     """
     if not 0 < metres < math.inf:
         raise ValueError(f"Expected `--length` to have a length above 0 m, but got {metres}.")
     if name == "object":
         return metres
+    parts, names = preview.parts, [] if preview.parts is None else preview.parts.names
     if ":" in name:
-        return metres / (float((_place(name, 0, seen) - _place(name, 1, seen)).norm()) * preview.metres_per_unit)
-    parts = preview.parts
-    names = [] if parts is None else parts.names
-    if parts is None or name not in names:
+        try:
+            pixels = np.array([[float(value) for value in place.split(",")] for place in name.split(":")])
+            (one, other), known = in_space(picture, camera, pixels.reshape(2, 2) / full)
+        except ValueError:
+            raise ValueError(
+                f"Expected `--length` to have two places such as 120,80:120,640, but got {name}."
+            ) from None
+        if not known.all():
+            raise ValueError(f"A place of `--length {name}` is not on the splat: look at {PICTURE} for places.")
+        span = float(np.linalg.norm(one - other))
+    elif parts is None or name not in names:
         raise ValueError(
             f"The splat has no part {name!r}: `--length` may name {', '.join([*names, 'object'])}, or two places in "
             "the first frame, such as 120,80:120,640 (pixels from its left and upper edges)."
         )
-    return metres / (extent(seen.cloud.means[parts.mask(name)], preview.up.direction) * preview.metres_per_unit)
+    else:
+        span = extent(cloud.means[parts.mask(name)], preview.up.direction)
+    return metres / (span * preview.metres_per_unit)
 
 
 def extent(points: Tensor, up: Sequence[float]) -> float:
@@ -323,25 +319,10 @@ def extent(points: Tensor, up: Sequence[float]) -> float:
     return float(sides(np.column_stack([own @ axis, turned]), 0.002).max())
 
 
-def _place(name: str, number: int, seen: Seen) -> Tensor:
-    try:
-        x, y = (float(value) / seen.film.full for value in name.split(":")[number].split(","))
-    except ValueError:
-        raise ValueError(f"Expected `--length` to have two places such as 120,80:120,640, but got {name}.") from None
-    place, known = in_space(seen.picture, seen.camera, np.array([[x, y]]))
-    if not known[0]:
-        raise ValueError(
-            f"The place {name.split(':')[number]} of `--length` is not on the splat: look at {PICTURE} for places."
-        )
-    return torch.from_numpy(place[0])
-
-
 def plan_text(
     preview: Suggestion, background: Sequence[float], still: float | None, length: Length, folder: Path
 ) -> str:
     """The fit file; ``still`` is the time at rest before the motion [s], None if the film may begin in motion."""
-    import yaml
-
     middle, half = 0.0, 200.0  # more than all ways round, so that none is at an end of the range
     if preview.hold.name == "side":  # a flag flies away from its pole
         middle, half = math.degrees(math.atan2(preview.flow[1], preview.flow[0])), 120.0
@@ -349,8 +330,8 @@ def plan_text(
         "wind.speed": SPEED,
         "wind.azimuth": (round(middle - half), round(middle + half)),
         "material.E": [float(f"{preview.youngs_modulus * factor:.1e}") for factor in (SOFTER, STIFFER)],
+        FILM_START: (-1.0, 0.1) if still is None else (0.0, round(still + 0.1, 2)),
     }
-    ranges[FILM_START] = (-1.0, 0.1) if still is None else (0.0, round(still + 0.1, 2))
     plan = {
         "base": f"{LOOK}/starter.yaml",
         "videos": CAMERAS,

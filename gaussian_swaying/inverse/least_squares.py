@@ -8,12 +8,15 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
+from scipy.optimize import least_squares
+from scipy.stats import chi
 from torch import Tensor
 
 STEP = 0.004  # step of the finite differences, as a share of the range
 HUBER = 1.345  # standard deviations above which a residual counts less (Huber 1981: 95 % efficiency)
 REACH = 0.25  # longest first step, as a share of each range
 CLOSELY, ROUGHLY = (3e-4, 1e-4), (9e-3, 3e-3)  # shortest step, and least gain per cost, of the last stage and others
+ROBUSTLY: dict[str, Any] = {"method": "dogbox", "x_scale": REACH, "loss": "huber", "f_scale": HUBER}
 ALIKE = 1.1  # ratio of standard deviations of the residuals below which they stay
 LEAST = 0.05  # least standard deviation of the residuals [pixels]
 NO_STEP = "no step is better"
@@ -46,14 +49,9 @@ class Solved:
     ended: str
     steps: int
 
-    @property
-    def cost(self) -> float:
-        """Mean of Huber's function over all residuals, each in standard deviations."""
-        return float(cost_of(self.block, self.scale)[0])
-
 
 def cost_of(block: Block, scale: float) -> Tensor:
-    """Cost of each variant, shape (B,); infinite for one that is not finite."""
+    """Cost of each variant, shape (B,): mean of Huber's function of residuals per ``scale``; infinite if not finite."""
     size = (block.values / scale).abs().flatten(1)
     total = torch.where(size < HUBER, 0.5 * size.square(), HUBER * (size - 0.5 * HUBER)).sum(1)
     return torch.where(torch.isfinite(total), total, float("inf")) / max(block.values.shape[1], 1)
@@ -61,8 +59,6 @@ def cost_of(block: Block, scale: float) -> Tensor:
 
 def scale_of(block: Block, least: float = LEAST) -> float:
     """Robust standard deviation of the residuals of the first variant, from the median of their lengths."""
-    from scipy.stats import chi
-
     size = block.values[0].norm(dim=-1)
     middle = float(size.nanmedian()) if len(size) else 0.0
     return max(0.0 if math.isnan(middle) else middle / chi.median(block.values.shape[-1]), least)
@@ -75,8 +71,6 @@ def solve(
 
     The standard deviation of the residuals is that of the place, and is estimated anew where it ends, until it stays.
     """
-    from scipy.optimize import least_squares
-
     xtol, ftol = CLOSELY if closely else ROUGHLY
     begin = place.double()
     known = {begin.numpy().tobytes(): residuals(begin[None])}
@@ -96,20 +90,9 @@ def solve(
         high, low = (residuals(both).values.flatten(1)[:, used].double() / sigma).chunk(2)
         return torch.nan_to_num((high - low) / widths[:, None], posinf=0.0, neginf=0.0).T.numpy()
 
-    found = least_squares(  # of shifts from the place, as its first step is then no longer than `x_scale`
-        at,
-        0 * begin.numpy(),
-        slopes,
-        bounds=((-begin).numpy(), (1 - begin).numpy()),
-        method="dogbox",
-        x_scale=REACH,
-        loss="huber",
-        f_scale=HUBER,
-        xtol=xtol,
-        ftol=ftol,
-        gtol=None,
-        max_nfev=1 + most,
-    )
+    ends = {"xtol": xtol, "ftol": ftol, "gtol": None, "max_nfev": 1 + most}
+    bounds = ((-begin).numpy(), (1 - begin).numpy())  # of shifts, as the first step is then no longer than `x_scale`
+    found = least_squares(at, 0 * begin.numpy(), slopes, bounds, **ROBUSTLY, **ends)
     end = (begin + torch.from_numpy(found.x)).clamp(0.0, 1.0)
     block = known.get(end.numpy().tobytes()) or residuals(end[None])
     ended = {0: "", 2: f"the last step lowered the cost by less than {ftol:.2%}"}.get(
@@ -133,7 +116,7 @@ def _beside(place: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def covariance(matrix: Tensor, scores: Sequence[Tensor]) -> Tensor:
-    r"""Covariance of the unknowns in shares of their ranges, shape (U, U), from what :func:`linearised` returns.
+    r"""Covariance of the unknowns in shares of their ranges, shape (U, U), from what :func:`normal` returns.
 
     :math:`A^{-1} \bigl(\sum \tfrac{C}{C - 1} \sum_c g_c g_c^T\bigr) A^{-1} + A^{-1}`, where the gradients are summed
     over clusters of correlated residuals: the sandwich of White (1980) and Liang & Zeger (1986). The usual
@@ -148,7 +131,7 @@ def covariance(matrix: Tensor, scores: Sequence[Tensor]) -> Tensor:
     return inverse @ middle @ inverse + inverse
 
 
-def linearised(
+def normal(
     residuals: Residuals, place: Tensor, scale: Callable[[Block], float] = scale_of
 ) -> tuple[Tensor, list[Tensor]]:
     """Normal equations at a place, from central differences of one batch.

@@ -146,7 +146,7 @@ def turn(angle: float) -> float:
     return (angle + 180) % 360 - 180
 
 
-def mirrored_place(model: Model, unknowns: Sequence[Unknown], place: Sequence[float]) -> list[list[float]]:
+def mirror_of(model: Model, unknowns: Sequence[Unknown], place: Sequence[float]) -> list[list[float]]:
     """The place with the mirrored wind, as shares of the ranges; none if there is none within them."""
     for k, unknown in enumerate(unknowns):
         azimuth = mirrored(model, unknown.value(place[k])) if unknown.name == "wind.azimuth" else None

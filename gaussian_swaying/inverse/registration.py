@@ -1,4 +1,4 @@
-"""The camera of a frame, from the splat that it shows."""
+"""The camera of a frame, and of each frame of a film from a hand, from the splat that they show."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from gaussian_swaying.gaussians.cloud import GaussianCloud
@@ -19,9 +20,10 @@ from gaussian_swaying.gaussians.measures import Gaussians
 from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.geometry.origin import Origin
 from gaussian_swaying.inverse.plan import FILM_START
-from gaussian_swaying.inverse.tracks import ALIKE, GREY, alike, corners, follow, opencv, picture_of
+from gaussian_swaying.inverse.tracks import ALIKE, GREY, STILL, alike, corners, follow, opencv, picture_of
 from gaussian_swaying.inverse.videos import Footage
 from gaussian_swaying.rendering.cameras.camera import Camera, orbit_camera
+from gaussian_swaying.rendering.gsplat_renderer import make_renderer
 from gaussian_swaying.rendering.protocol import RenderOutput
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.suggestion.up import guess_up
@@ -37,6 +39,14 @@ AWAY = 3.0  # largest distance of a first frame from the splat at rest [pixels]
 LARGER, ASIDE = 1.08, 10.0  # ratio of distances, and angle [degrees], from which a camera is another one
 PICTURE, CAMERAS = "registration.png", "transforms.json"
 STILLS = (".png", ".jpg", ".jpeg")
+SHARE = 0.02  # share of a pixel from which what moves is seen in it
+REACH = 0.25  # how far what is simulated goes, per its longer side in the picture
+LOOKS = 8  # frames that are compared with the first one to see whether a camera moves
+DRAWN, FIRST = 2, 4  # pictures that are drawn for a frame, and for the first one
+AGREE, MANY = 0.25, 0.2  # share of points that agree on a camera; of frames without background in a doubtful fit
+BLOCK = 4  # side of squares over which colours are averaged [pixels]
+DARK, BRIGHT = 8, 247  # mean grey level that tells nothing, and that of a pixel which may be cut off
+FEWEST_SQUARES = 50  # fewest squares that make a gain
 Draw = Callable[[Camera], RenderOutput]  # draws the splat, at rest
 
 
@@ -52,8 +62,6 @@ class Registration:
 
 def painter_of(cloud: GaussianCloud) -> Draw:
     """A function that draws a splat on black, in the colours that it has from all sides."""
-    from gaussian_swaying.rendering.gsplat_renderer import make_renderer
-
     renderer = make_renderer(torch.device("cpu"))
     shape, colour = covariance(cloud.quats, cloud.scales), (0.5 + SH_DC * cloud.sh[:, 0]).clamp(0, 1)
 
@@ -191,12 +199,7 @@ def _by_features(
 
 
 def by_flow(
-    grey: Any,
-    picture: RenderOutput,
-    camera: Camera,
-    focal: bool = False,
-    near: float = 0.0,
-    where: Tensor | None = None,
+    grey: Any, picture: RenderOutput, camera: Camera, focal: bool = False, near: float = 0, where: Tensor | None = None
 ) -> Registration | None:
     """The camera of a frame, as :func:`grey_of` has it, from a picture from nearby; None if too few points agree.
 
@@ -214,17 +217,14 @@ def by_flow(
 
 
 def _seen_from(
-    picture: RenderOutput, camera: Camera, here: Any, there: Any, focal: bool, near: float = 0.0
+    picture: RenderOutput, camera: Camera, here: Any, there: Any, focal: bool, near: float = 0
 ) -> Registration | None:
     """The camera that sees what the picture shows at ``here`` at ``there``; None if too few pairs agree."""
     cv2, K = opencv(), camera.intrinsics.double().cpu().numpy()
     world, known = in_space(picture, camera, here)
     world, there = world[known], np.ascontiguousarray(there[known], dtype=np.float64)
-    pose = (
-        pose_of(world, there, K, near or NEAR * math.hypot(camera.width, camera.height))
-        if len(world) >= LEAST
-        else None
-    )
+    near = near or NEAR * math.hypot(camera.width, camera.height)
+    pose = pose_of(world, there, K, near) if len(world) >= LEAST else None
     if pose is None or pose[0].sum() < LEAST:
         return None
     agree, turn, shift, _ = pose
@@ -266,8 +266,6 @@ def first_look(simulation: Simulation, video: Footage, earliest: float | None) -
     ``earliest`` is the low end of the range of ``film.start`` [s], None if that is not sought. A film that may begin in
     motion may look like anything in its first frame; ValueError if any other does not show the splat.
     """
-    from scipy.spatial.transform import Rotation
-
     rest, frame, given = simulation.scene.rest(), video.images[0], video.cameras[0]
 
     def draw(camera: Camera) -> RenderOutput:
@@ -304,3 +302,182 @@ def first_look(simulation: Simulation, video: Footage, earliest: float | None) -
         "from where its `transform_matrix` says: its places are in another unit than the splat, or it is another "
         "camera. Find it with `gaussian-swaying camera FILM SPLAT`."
     ]
+
+
+class Background:
+    """Draws a scene at rest, and says which pixels show what is not simulated, nor named in ``also_moves``."""
+
+    def __init__(self, simulation: Simulation, also_moves: Sequence[str] = ()) -> None:
+        scene = simulation.scene
+        self._painter, self._rest = simulation.painter, scene.rest()
+        simulated = torch.zeros(len(self._rest.means), dtype=torch.bool)
+        simulated[scene.moving.cpu()] = True
+        named = torch.zeros_like(simulated)
+        for name in also_moves:
+            if scene.parts is None:
+                raise ValueError(f"`also_moves` has {name!r}, but the scene has no parts: set `scene.parts`.")
+            named |= scene.parts.mask(name)[scene.drawn]
+        self.exists = not bool((simulated | named).all())
+        self._moves = torch.stack([simulated, named, named], 1).to(self._rest.means)
+
+    @torch.no_grad()
+    def draw(self, camera: Camera) -> tuple[RenderOutput, Tensor]:
+        """The picture of the scene at rest, and its background: bool, on the CPU, shape (H, W)."""
+        painter, rest = self._painter, self._rest
+        camera = camera.to(painter.device)
+        picture = painter.picture(rest, camera)
+        drawn = painter.renderer(rest.means, rest.covariances, painter.opacity(), self._moves, camera).color
+        simulated, named, _ = (drawn > SHARE).cpu().unbind(-1)
+        if bool(simulated.any()):
+            cv2, places = opencv(), simulated.nonzero()
+            side = 1 + int((places.amax(0) - places.amin(0)).max())
+            away = cv2.distanceTransform((~simulated).byte().numpy(), cv2.DIST_L2, 5)
+            simulated = torch.from_numpy(away) <= REACH * side
+        return picture, (picture.alpha[..., 0].cpu() > SOLID) & ~simulated & ~named
+
+
+def moves_by(video: Footage, background: Background) -> float:
+    """Distance that the background goes in the film of a camera that is said to stand still [pixels]; 0 if unknown.
+
+    Of each point only the motion across its edge counts, as nothing holds it along a plain pole.
+    """
+    cv2 = opencv()
+    _, still = background.draw(video.cameras[0])
+    first = grey_of(video.images[0])
+    start, most = corners(first, 300, 0.01, 7, still.byte().numpy()), 0.0
+    if len(start) < LEAST:
+        return 0.0
+    column, row = (start - 0.5).round().astype(int).T
+    across = cv2.cornerEigenValsAndVecs(first, 7, 3)[row, column, 2:4]
+    last = len(video.times) - 1
+    for k in sorted({round(last * (n + 1) / LOOKS) for n in range(LOOKS)}):
+        (_, position), (_, seen) = follow(np.stack([first, grey_of(video.images[k])]), start)
+        if seen.sum() >= LEAST:
+            most = max(most, float(np.median(abs(((position - start) * across)[seen].sum(-1)))))
+    return most
+
+
+def follow_camera(
+    video: Footage, background: Background, tick: Callable[[int], object] = int
+) -> tuple[Footage, tuple[int, ...], float]:
+    """The video with the camera of each frame, from that of the first frame.
+
+    Frames that show too little of the background are listed, and have a camera between those of their neighbours. The
+    number is the median distance of points that agree [pixels].
+    """
+    found: list[Registration | None] = []
+    camera = video.cameras[0]
+    for image in video.images:
+        for _ in range(DRAWN if found else FIRST):
+            picture, still = background.draw(camera)
+            seen = by_flow(grey_of(image), picture, camera, where=still)
+            if seen is None or seen.agreeing < AGREE * seen.matches:
+                seen = None
+                break
+            camera = seen.camera
+        found.append(seen)
+        tick(1)
+    unseen = tuple(k for k, camera in enumerate(found) if camera is None)
+    if 2 * len(unseen) > len(found):
+        raise ValueError(
+            f"The camera {video.name!r} moves, but {len(unseen)} of its {len(found)} frames show too little of what "
+            "stands still in the splat: stand it on a tripod, or film something still and textured, too, and have it "
+            "in the splat."
+        )
+    seen_at = [(time, one) for time, one in zip(video.times, found, strict=True) if one is not None]
+    moments, poses = [time for time, _ in seen_at], [one.camera.world_to_camera.double() for _, one in seen_at]
+    there, times = torch.linalg.inv(torch.stack(poses)).numpy(), np.clip(video.times, moments[0], moments[-1])
+    pose = np.zeros((len(times), 4, 4)) + np.eye(4)
+    pose[:, :3, :3] = Slerp(moments, Rotation.from_matrix(there[:, :3, :3]))(times).as_matrix()
+    pose[:, :3, 3] = np.stack([np.interp(times, moments, own) for own in there[:, :3, 3].T], 1)
+    views = torch.linalg.inv(torch.from_numpy(pose)).to(video.cameras[0].world_to_camera)
+    cameras = tuple(replace(seen_at[0][1].camera, world_to_camera=view) for view in views)
+    residual = float(torch.tensor([one.residual for _, one in seen_at]).median())
+    return replace(video, cameras=cameras), unseen, residual
+
+
+def gains(video: Footage, background: Background) -> Tensor | None:
+    """Brightness of each frame over that of the splat in red, green and blue, float64, shape (F, 3).
+
+    Frames that show too little of the background have those of their neighbours; None if all do.
+    """
+    found, drawn = [], None
+    for camera, image in zip(video.cameras, video.images, strict=True):
+        if drawn is not camera:
+            drawn = camera
+            picture, still = background.draw(camera)
+            wanted = 255 * picture.color.cpu().double()
+        found.append(gain_of(image.double(), wanted, still).numpy())
+    rows, times = np.stack(found), np.array(video.times)
+    known = np.isfinite(rows[:, 0])
+    if not known.any():
+        return None
+    return torch.from_numpy(np.stack([np.interp(times, times[known], own[known]) for own in rows.T], 1))
+
+
+def gain_of(image: Tensor, picture: Tensor, still: Tensor) -> Tensor:
+    """The gain of each colour, float64, shape (3,), between a picture and an image of grey levels up to 255 (H, W, 3).
+
+    It is the median over squares of the mask ``still`` (H, W); NaN if there are too few.
+    """
+    inside = _averaged(still.double()[..., None])[:, 0] == 1
+    seen, wanted = _averaged(image), _averaged(picture)
+    cut = _averaged((torch.maximum(image, picture) >= BRIGHT).double())
+    inside &= ((seen > DARK) & (wanted > DARK) & (cut == 0)).all(1)
+    return (seen / wanted)[inside].median(0).values if int(inside.sum()) >= FEWEST_SQUARES else torch.nan * seen[0]
+
+
+def with_gains(images: Tensor, found: Sequence[Tensor] | Tensor) -> Tensor:
+    """Frames (F, H, W, 3), uint8, divided by their gains (F, 3)."""
+    out = torch.empty_like(images)  # a film may be large: no second list of its frames
+    for one, image, gain in zip(out, images, found, strict=True):
+        one.copy_((image.float() / gain.float()).round().clamp(0, 255))
+    return out
+
+
+def _averaged(picture: Tensor) -> Tensor:
+    return torch.nn.functional.avg_pool2d(picture.permute(2, 0, 1)[None], BLOCK)[0].flatten(1).T
+
+
+def prepared(
+    simulation: Simulation,
+    videos: Sequence[Footage],
+    hand_held: bool | None = None,
+    also_moves: Sequence[str] = (),
+    tick: Callable[[int], object] = int,
+) -> tuple[list[Footage], list[str], list[str]]:
+    """Find the camera of each frame of films from a hand, and take drifts of exposure and white balance off all films.
+
+    Returns:
+        The films, and sentences: what the background says of them, if the splat has one, and what speaks against them.
+    """
+    background = Background(simulation, also_moves)
+    if not background.exists:
+        if hand_held:
+            raise ValueError(
+                "`hand_held` needs something that stands still in the splat, but all of it moves: stand the camera on "
+                "a tripod, or have something still and textured, too, in the film and in the splat."
+            )
+        return list(videos), [], []
+    found, told, doubts = [], list[str](), list[str]()
+    for video in videos:
+        still = all(torch.equal(video.cameras[0].world_to_camera, camera.world_to_camera) for camera in video.cameras)
+        moved = moves_by(video, background) if still and hand_held is not False else 0.0
+        if hand_held or (moved > STILL and hand_held is None):
+            video, unseen, residual = follow_camera(video, background, tick)
+            told.append(
+                f"camera {video.name}: held in a hand; its background goes {moved:.3g} pixels. The camera of each "
+                f"frame was found, {residual:.2f} pixels off."
+            )
+            if len(unseen) > MANY * len(video.times):
+                doubts.append(
+                    f"camera {video.name}: {len(unseen)} of {len(video.times)} frames show too little of what stands "
+                    "still, and have the camera of their neighbours: film more of it, or from a tripod."
+                )
+        if (bright := gains(video, background)) is not None:
+            video = replace(video, images=with_gains(video.images, bright))
+            rows = zip(("red", "green", "blue"), bright.amin(0).tolist(), bright.amax(0).tolist(), strict=True)
+            divided = ", ".join(f"{name} {low:.2f} to {high:.2f}" for name, low, high in rows)
+            told.append(f"camera {video.name}: as bright as the splat now; the frames were divided by {divided}.")
+        found.append(video)
+    return found, told, doubts

@@ -12,6 +12,7 @@ from urllib.parse import quote
 
 import numpy as np
 import torch
+from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from gaussian_swaying._files import write_json, write_table, write_text
@@ -78,11 +79,11 @@ class Fit:
     @property
     def vague(self) -> list[str]:
         """Names of the unknowns that are not determined."""
-        values, errors, found = self.values, self.errors, []
-        for u in self.unknowns:
-            most = VAGUE * (abs(values[u.name]) if u.scale == "log" else u.high - u.low)
-            if errors[u.name] > (min(most, TURNED) if u.unit == "degrees" else most):
-                found.append(u.name)
+        found = []
+        for u, row in zip(self.unknowns, self.rows(), strict=True):
+            most = VAGUE * (abs(row["value"]) if u.scale == "log" else u.high - u.low)
+            most = min(most, TURNED) if u.unit == "degrees" else most
+            found += [u.name] if row["standard_error"] > most else []
         return found
 
     @property
@@ -213,35 +214,46 @@ def scene_text(values: Mapping[str, float], parser: ArgumentParser, settings: Na
 
 def consequences(assumed: Sequence[str], values: Mapping[str, float], simulation: Simulation) -> list[str]:
     """Sentences on what follows for the values from what was only assumed, of ``length`` and ``mass``."""
-    scene, found = simulation.scene, []
+    scene, speed = simulation.scene, values.get("wind.speed")
     longest = scene.size * scene.frame.metres_per_unit
-    if "length" in assumed:
-        speed = values.get("wind.speed")
-        told = "" if speed is None else f" In its own lengths the speed is {speed / longest:.3g} a second."
-        if any(simulation.model.value("solver.gravity")):
-            told += " Gravity makes both depend on the length: measure one, and give it with --length."
-        found.append(
-            f"No length is known: the longest side of what moves was taken as {longest:.3g} m. Metres a second and "
-            f"pascals have no absolute value then, while angles do.{told}"
-        )
-    if "mass" in assumed:
-        area = float(scene.points.mass.sum() / scene.patches.area.sum())
-        found.append(
-            f"The mass was taken as {area:.3g} kg/m². With twice the mass the speed is about 1.4 times and E twice as "
-            "large: weigh it, and set material.density."
-        )
-    return found
+    own = "" if speed is None else f" In its own lengths the speed is {speed / longest:.3g} a second."
+    if any(simulation.model.value("solver.gravity")):
+        own += " Gravity makes both depend on the length: measure one, and give it with --length."
+    area = float(scene.points.mass.sum() / scene.patches.area.sum())
+    told = {
+        "length": f"No length is known: the longest side of what moves was taken as {longest:.3g} m. Metres a second "
+        f"and pascals have no absolute value then, while angles do.{own}",
+        "mass": f"The mass was taken as {area:.3g} kg/m². With twice the mass the speed is about 1.4 times and E twice "
+        "as large: weigh it, and set material.density.",
+    }
+    return [sentence for name, sentence in told.items() if name in assumed]
 
 
 def write_before(folder: Path, tracks: Sequence[Tracks]) -> list[Path]:
-    """Write ``before/rest_CAMERA.png`` and ``before/tracks_CAMERA.png``, and return the files."""
+    """Write ``before/rest_CAMERA.png``, the scene at rest, and ``before/tracks_CAMERA.png``; return the files."""
     import imageio.v3 as iio
 
+    cv2, found = opencv(), []
     (folder / BEFORE).mkdir(parents=True, exist_ok=True)
-    found = []
     for own in tracks:
-        for name, picture in (("rest", _at_rest(own)), ("tracks", _ways(own))):
-            found.append(folder / BEFORE / f"{name}_{own.video.name}.png")
+        simulation, video, rest = own.simulation, own.video, own.simulation.scene.rest()
+        painter, parts = simulation.painter, classify(simulation)
+        colours = torch.tensor(STILL_TINT).repeat(len(parts.simulated), 1)
+        colours[(parts.simulated | parts.carried).cpu()] = torch.tensor(MOVING)
+        colours[parts.pinned.cpu()] = torch.tensor(HELD_TINT)
+        roles = painter.draw(rest, colours.to(painter.device), video.cameras[0].to(painter.device))
+        told = ("red: held, green: moves, grey: still", roles.color.detach().float().cpu().clamp(0, 1))
+        still = side_by_side(video.images[0], picture_of(simulation, rest, video.cameras[0]), told)
+        pale = (video.images[0].float() * 0.4 + 255 * 0.6).round().to(torch.uint8).numpy()
+        for seen, way in zip(own.seen.T, own.position.transpose(0, 1), strict=True):
+            places = way[seen].numpy().astype(np.int32)
+            colour = (20, 90, 220) if bool(seen[-1]) else (220, 120, 0)
+            cv2.polylines(pale, [places], False, colour, 1, cv2.LINE_AA)
+            for place in places[:1]:
+                cv2.circle(pale, place.tolist(), 2, colour, cv2.FILLED, cv2.LINE_AA)
+        title = f"{own.position.shape[1]} points followed; orange: {int((~own.seen[-1]).sum())} lost"
+        for name, picture in (("rest", still), ("tracks", titled([(title, torch.from_numpy(pale).float() / 255)]))):
+            found.append(folder / BEFORE / f"{name}_{video.name}.png")
             iio.imwrite(found[-1], picture)
     return found
 
@@ -254,35 +266,8 @@ def side_by_side(frame: Tensor, shown: RenderOutput, *more: tuple[str, Tensor]) 
     return titled([("first frame", real), ("splat half over it", both), ("splat", drawn), *more])
 
 
-def _at_rest(tracks: Tracks) -> Any:
-    simulation, video, rest = tracks.simulation, tracks.video, tracks.simulation.scene.rest()
-    painter, parts = simulation.painter, classify(simulation)
-    colours = torch.tensor(STILL_TINT).repeat(len(parts.simulated), 1)
-    colours[(parts.simulated | parts.carried).cpu()] = torch.tensor(MOVING)
-    colours[parts.pinned.cpu()] = torch.tensor(HELD_TINT)
-    roles = painter.draw(rest, colours.to(painter.device), video.cameras[0].to(painter.device))
-    told = ("red: held, green: moves, grey: still", roles.color.detach().float().cpu().clamp(0, 1))
-    return side_by_side(video.images[0], picture_of(simulation, rest, video.cameras[0]), told)
-
-
-def _ways(tracks: Tracks) -> Any:
-    """The first frame, pale, with the ways of the points that are followed."""
-    cv2 = opencv()
-    picture = (tracks.video.images[0].float() * 0.4 + 255 * 0.6).round().to(torch.uint8).numpy()
-    for seen, way in zip(tracks.seen.T, tracks.position.transpose(0, 1), strict=True):
-        places = way[seen].numpy().astype(np.int32)
-        colour = (20, 90, 220) if bool(seen[-1]) else (220, 120, 0)
-        cv2.polylines(picture, [places], False, colour, 1, cv2.LINE_AA)
-        for place in places[:1]:
-            cv2.circle(picture, place.tolist(), 2, colour, cv2.FILLED, cv2.LINE_AA)
-    told = f"{tracks.position.shape[1]} points followed; orange: {int((~tracks.seen[-1]).sum())} lost"
-    return titled([(told, torch.from_numpy(picture).float() / 255)])
-
-
 def titled(panels: Sequence[tuple[str, Tensor]]) -> Any:
     """Pictures (H, W, 3) side by side, colours in [0, 1], as a NumPy array, with a title above each."""
-    from PIL import Image, ImageDraw, ImageFont
-
     joined = torch.cat([panel for _, panel in panels], 1)
     height, width = joined.shape[:2]
     picture = Image.new("RGB", (width, height + BAND), (255, 255, 255))

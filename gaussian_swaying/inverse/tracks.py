@@ -85,6 +85,11 @@ class Tracks:
         return scene.model.means.detach()[scene.moving[self.index.to(scene.moving.device)]]
 
     @cached_property
+    def at_rest(self) -> Tensor:
+        """Where each frame would have them at rest [pixels], shape (F, T, 2)."""
+        return torch.stack([project(self.rest.cpu(), camera)[0] for camera in self.video.cameras])
+
+    @cached_property
     def _follow(self) -> Any:
         scene = self.simulation.scene
         return scene.follow.some(self.index.to(scene.moving.device)).to(scene.moving.device)
@@ -117,7 +122,7 @@ class Tracks:
 
     def still_until(self) -> float:
         """Time of the last frame before a quarter of them begins to move [s]; 0 if they move in the first frames."""
-        off = self.position - torch.stack([project(self.rest, camera)[0] for camera in self.video.cameras])
+        off = self.position - self.at_rest
         moved = (off - off[:1]).norm(dim=-1)
         moved = torch.where(self.seen, moved, torch.nan).nanquantile(0.75, dim=1)
         begun = (moved > STILL).nonzero()[:, 0]
@@ -186,16 +191,12 @@ def match(
         if k == 0 or share:
             beside = drawn_beside(painter, gaussians, video.cameras[k].to(painter.device), pixel)
             if k == 0 and bool(seen[0].any()):
-                share, shift = _at_rest((position[0] - pixel)[seen[0]], beside[seen[0]])
-                shift = torch.zeros_like(shift) if moving else shift
+                off, own = (position[0] - pixel)[seen[0]], beside[seen[0]]
+                share = float((-(off * own).sum() / own.square().sum().clamp(min=1e-12)).clamp(0.0, 1.0))
+                shift = shift if moving else (off + share * own).median(0).values
             position[k] += share * beside
         position[k] -= shift
     return Tracks(simulation, video, chosen, position, seen)
-
-
-def _at_rest(off: Tensor, beside: Tensor) -> tuple[float, Tensor]:
-    share = float((-(off * beside).sum() / beside.square().sum().clamp(min=1e-12)).clamp(0.0, 1.0))
-    return share, (off + share * beside).median(0).values
 
 
 def follow(images: Any, start: Any) -> tuple[Any, Any]:
@@ -284,7 +285,5 @@ def opencv() -> Any:
     try:
         import cv2
     except ImportError as error:
-        raise ImportError(
-            "A fit and a registration need OpenCV: pip install 'gaussian-swaying[fit]'.", name="cv2"
-        ) from error
+        raise ImportError("A fit needs OpenCV: pip install 'gaussian-swaying[fit]'.", name="cv2") from error
     return cv2

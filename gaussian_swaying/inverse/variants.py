@@ -14,9 +14,8 @@ from gaussian_swaying.inverse.least_squares import Block
 from gaussian_swaying.inverse.plan import FILM_START, Unknown, Values, of_simulation
 from gaussian_swaying.inverse.tracks import Tracks
 from gaussian_swaying.mpm.state import State
-from gaussian_swaying.rendering.cameras.camera import project
 from gaussian_swaying.simulation.measure import SimulationDiverged
-from gaussian_swaying.simulation.model import Model, number
+from gaussian_swaying.simulation.model import number
 from gaussian_swaying.simulation.simulation import Simulation
 from gaussian_swaying.simulation.step import Stepper, why_not_batched
 from gaussian_swaying.wind.force import with_added_mass
@@ -67,7 +66,20 @@ def states_of(
         alike: Take the same substeps for all, those of the stiffest, so that differences come from the values alone. If
             not, variants that need more substeps are batches of their own, and a variant may end in NaN.
     """
-    groups = _groups(simulation, values, alike)
+    models = [simulation.model.at(of_simulation(own)) for own in values]
+    shared: dict[tuple[object, ...], list[int]] = {}
+    for index, (own, model) in enumerate(zip(values, models, strict=True)):
+        points = with_added_mass(model.points, model.scene.patches, model.aero)
+        squared = float((points.youngs_modulus * points.volume / points.mass).amax())  # of the speed of sound, about
+        apart = [pair for pair in sorted(own.items()) if pair[0] == FILM_START or not number(pair[0]).batched]
+        shared.setdefault((*apart, 0 if alike else round(2 * math.log2(squared))), []).append(index)
+    groups = []
+    for members in shared.values():
+        part = [models[k] for k in members]
+        solver = simulation.solver.like(part[0].solver)
+        assign(solver, substep=None)  # a stiffer variant may need a shorter one
+        stepper = Stepper(solver, part, lenient=not alike)
+        groups.append(_Group(members, stepper, stepper.bind(), values[members[0]].get(FILM_START, 0.0)))
     before = math.ceil(max(0.0, -min(group.start for group in groups)) / simulation.frame_dt)
     for k in range(-before, 0):  # the run-up, frame by frame
         _advance(groups, k * simulation.frame_dt, (k + 1) * simulation.frame_dt, alike)
@@ -78,22 +90,6 @@ def states_of(
             now = time
         found = [(member, group.state.scene(k)) for group in groups for k, member in enumerate(group.members)]
         yield [state for _, state in sorted(found, key=lambda pair: pair[0])]
-
-
-def _groups(simulation: Simulation, values: Sequence[Values], alike: bool) -> list[_Group]:
-    models = [simulation.model.at(of_simulation(own)) for own in values]
-    shared: dict[tuple[object, ...], list[int]] = {}
-    for index, (own, model) in enumerate(zip(values, models, strict=True)):
-        apart = [pair for pair in sorted(own.items()) if pair[0] == FILM_START or not number(pair[0]).batched]
-        shared.setdefault((*apart, 0 if alike else _stiffness_class(model)), []).append(index)
-    found = []
-    for members in shared.values():
-        part = [models[k] for k in members]
-        solver = simulation.solver.like(part[0].solver)
-        assign(solver, substep=None)  # a stiffer variant may need a shorter one
-        stepper = Stepper(solver, part, lenient=not alike)
-        found.append(_Group(members, stepper, stepper.bind(), values[members[0]].get(FILM_START, 0.0)))
-    return found
 
 
 def _advance(groups: Sequence[_Group], begin: float, end: float, alike: bool) -> None:
@@ -120,16 +116,9 @@ def _advance(groups: Sequence[_Group], begin: float, end: float, alike: bool) ->
             group.state = state
 
 
-def _stiffness_class(model: Model) -> int:
-    """A number that is equal for materials whose fastest waves differ by less than a fifth or so."""
-    points = with_added_mass(model.points, model.scene.patches, model.aero)
-    squared = (points.youngs_modulus * points.volume / points.mass).amax()
-    return round(2 * math.log2(float(squared)))
-
-
 def compare(
     evidence: Sequence[Tracks],
-    values: Sequence[Values],
+    values: Sequence[dict[str, float]],
     times: Sequence[float],
     moving: bool = False,
     tick: Callable[[int], object] = int,
@@ -146,7 +135,7 @@ def compare(
         for time in times:
             _, what = wanted.setdefault(round(max(0.0, time - start), 6), (max(0.0, time - start), []))
             what += [(k, time)] if time > 0 or moving else []  # at rest all variants are alike
-    own = list(map(of_simulation, values)) if starts else values
+    own = [one | {FILM_START: 0.0} for one in values] if starts else values
     moments = [wanted[key] for key in sorted(wanted)]
 
     def compared(alike: bool) -> list[Block]:
@@ -175,19 +164,15 @@ def explained(parts: Sequence[Tracks], values: Values, times: Sequence[float]) -
 
     A track that slipped off the object explains nothing, no less: one of them would decide the sum of all.
     """
-    sums = [torch.zeros(2, len(part.rest), dtype=torch.float64) for part in parts]
-    for k, frame, pixel in _pixels(parts, values, times):
-        part = parts[k]
-        seen = part.seen[frame]
-        there = part.position[frame, seen]
-        rest = project(part.rest.cpu()[seen], part.video.cameras[frame])[0]
-        left = ((pixel[seen] - there).square().sum(-1) - NOISE**2).clamp(min=0).nan_to_num(torch.inf)
-        sums[k][:, seen] += torch.stack([left, (there - rest).square().sum(-1)])
-    return {
-        part.video.name: 1 - float(torch.minimum(left, moved).sum() / moved.sum())
-        for part, (left, moved) in zip(parts, sums, strict=True)
-        if bool(moved.any())
-    }
+    found = {}
+    for part, pixel in zip(parts, _pixels(parts, values, times), strict=True):
+        there, seen = part.position[: len(pixel)], part.seen[: len(pixel)]
+        left = ((pixel - there).square().sum(-1) - NOISE**2).clamp(min=0).nan_to_num(torch.inf)
+        moved = (there - part.at_rest[: len(pixel)]).square().sum(-1)
+        left, moved = (torch.where(seen, own, 0.0).sum(0) for own in (left, moved))
+        if bool(moved.any()):
+            found[part.video.name] = 1 - float(torch.minimum(left, moved).sum() / moved.sum())
+    return found
 
 
 def split(tracks: Tracks) -> tuple[Tracks, Tracks]:
@@ -208,20 +193,20 @@ def trusted(
     """
     if not others:
         return list(evidence)
-    own = {(k, frame): pixel for k, frame, pixel in _pixels(evidence, values, times)}
-    squares = {key: torch.zeros(len(pixel), dtype=torch.float64) for key, pixel in own.items()}
+    own, squares = _pixels(evidence, values, times), [torch.zeros(part.seen.shape).double() for part in evidence]
     for other in others:
-        for k, frame, pixel in _pixels([replace(part, simulation=other) for part in evidence], values, times):
-            off = torch.nan_to_num(pixel - own[k, frame])  # NaN: it diverged
-            squares[k, frame] += off.square().sum(-1) / (2 * len(others))
-    trust = [torch.ones(part.seen.shape, dtype=torch.float64) for part in evidence]
-    for (k, frame), square in squares.items():
-        trust[k][frame] = (1 + square / NOISE**2).rsqrt()
-    return [replace(part, trust=own) for part, own in zip(evidence, trust, strict=True)]
+        moved = _pixels([replace(part, simulation=other) for part in evidence], values, times)
+        for square, pixel, here in zip(squares, moved, own, strict=True):
+            off = torch.nan_to_num(pixel - here)  # NaN: it diverged
+            square[: len(off)] += off.square().sum(-1) / (2 * len(others))
+    return [replace(part, trust=(1 + q / NOISE**2).rsqrt()) for part, q in zip(evidence, squares, strict=True)]
 
 
-def _pixels(parts: Sequence[Tracks], values: Values, times: Sequence[float]) -> Iterator[tuple[int, int, Tensor]]:
+def _pixels(parts: Sequence[Tracks], values: Values, times: Sequence[float]) -> list[Tensor]:
+    """Where the first frames of each camera, up to the last time, would have its Gaussians [pixels], (F, T, 2)."""
+    found: list[list[Tensor]] = [[] for _ in parts]
     for time, states in zip(times, states_of(parts[0].simulation, [values], times, alike=False), strict=True):
-        for k, part in enumerate(parts):
-            if (frame := part.video.frame_at(time)) is not None:
-                yield k, frame, part.pixels(part.shown(states), frame)[0]
+        for part, own in zip(parts, found, strict=True):
+            if part.video.frame_at(time) is not None:
+                own.append(part.pixels(part.shown(states), len(own))[0])
+    return list(map(torch.stack, found))

@@ -8,7 +8,6 @@ import os
 from bisect import bisect_left
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing
-from copy import copy
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
@@ -56,21 +55,14 @@ class Footage:
         return found if found < len(self.times) and self.times[found] < time + CLOSE else None
 
 
-class _Room:
-    """What the videos of a fit may still decode."""
-
-    def __init__(self) -> None:
-        self.bytes = MOST_BYTES
-
-    def take(self, path: Path, width: int, height: int, frames: int = 1) -> None:
-        """Count frames of a file."""
-        self.bytes -= frames * 3 * width * height
-        if self.bytes < 0:
-            raise ValueError(
-                f"The videos have more than {MOST_BYTES / 2**30:g} GiB of pixels together ({path}, {width} x "
-                f"{height}): cut them to the motion that is fitted and predicted, make them smaller, or choose "
-                "`cameras`."
-            )
+def _take(room: list[int], path: Path, width: int, height: int, frames: int = 1) -> None:
+    """Take frames of a file off the bytes that may still be decoded."""
+    room[0] -= frames * 3 * width * height
+    if room[0] < 0:
+        raise ValueError(
+            f"The videos have more than {MOST_BYTES / 2**30:g} GiB of pixels together ({path}, {width} x {height}): "
+            "cut them to the motion that is fitted and predicted, make them smaller, or choose `cameras`."
+        )
 
 
 Shots = tuple[Tensor, Lens, list[Tensor], float]  # pose, lens without distortion, pictures, and their rate [1/s]
@@ -90,7 +82,7 @@ def read_videos(
         size: Size of what they show [scene units], which the near plane of the cameras follows.
         origin: Point of the files from which the places of the splat count.
     """
-    parts: dict[str, list[tuple[float, Callable[[_Room], Shots] | Path]]] = {}  # a path is a missing picture
+    parts: dict[str, list[tuple[float, Callable[[list[int]], Shots] | Path]]] = {}  # a path is a missing picture
     owners: dict[str, int] = {}
     for number, path in enumerate([paths] if isinstance(paths, str | os.PathLike) else paths):
         for name, time, part in _read(Path(path)):
@@ -107,7 +99,7 @@ def read_videos(
             f"{len(lost)} of the pictures of `videos` do not exist, the first of them {lost[0]}: put them there, or "
             "remove their frames from transforms.json."
         )
-    room, found = _Room(), []
+    room, found = [MOST_BYTES], []
     for name, own_parts in wanted.items():
         shots: list[tuple[float, Camera, Tensor]] = []
         for time, part in own_parts:
@@ -116,7 +108,19 @@ def read_videos(
             pose = counted_pose(view, origin).float()
             camera = Camera(pose, lens.intrinsics().float(), lens.width, lens.height, NEAR * size)
             shots += [(time + k / rate, camera, image) for k, image in enumerate(images)]
-        found.append(_footage(name, shots, begin))
+        taken, views, frames = zip(*sorted(shots, key=itemgetter(0)), strict=True) if shots else ((), (), ())
+        for before, after in pairwise(taken):
+            if after - before < 1e-6:
+                raise ValueError(
+                    f"The camera {name!r} has two frames at {after:g} s: give every camera its own `camera` in "
+                    "transforms.json, and every frame its `time`."
+                )
+        sizes = {tuple(image.shape[:2]) for image in frames}
+        if len(sizes) > 1:
+            raise ValueError(f"The frames of camera {name!r} have different sizes: {sorted(sizes)}; make them equal.")
+        if len(frames) < 3:
+            raise ValueError(f"The camera {name!r} has {len(frames)} frames: a motion needs three or more.")
+        found.append(Footage(name, tuple(time - begin for time in taken), views, torch.stack(frames)))
     return found
 
 
@@ -129,23 +133,7 @@ def frame_times(videos: Sequence[Footage]) -> list[float]:
     return found
 
 
-def _footage(name: str, shots: list[tuple[float, Camera, Tensor]], begin: float) -> Footage:
-    taken, cameras, images = zip(*sorted(shots, key=itemgetter(0)), strict=True) if shots else ((), (), ())
-    for before, after in pairwise(taken):
-        if after - before < 1e-6:
-            raise ValueError(
-                f"The camera {name!r} has two frames at {after:g} s: give every camera its own `camera` in "
-                "transforms.json, and every frame its `time`."
-            )
-    sizes = {tuple(image.shape[:2]) for image in images}
-    if len(sizes) > 1:
-        raise ValueError(f"The frames of camera {name!r} have different sizes: {sorted(sizes)}; make them equal.")
-    if len(images) < 3:
-        raise ValueError(f"The camera {name!r} has {len(images)} frames: a motion needs three or more.")
-    return Footage(name, tuple(time - begin for time in taken), cameras, torch.stack(images))
-
-
-def _read(path: Path) -> Iterator[tuple[str, float, Callable[[_Room], Shots] | Path]]:
+def _read(path: Path) -> Iterator[tuple[str, float, Callable[[list[int]], Shots] | Path]]:
     """Camera, time [s] and reader of each picture and film."""
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist: set `videos` to a folder with transforms.json.")
@@ -171,14 +159,14 @@ def _read(path: Path) -> Iterator[tuple[str, float, Callable[[_Room], Shots] | P
             yield camera, time, partial(_picture, posed[name]) if name in posed else file.parent / name
 
 
-def _picture(item: PosedImage, room: _Room) -> Shots:
-    room.take(item.path, item.lens.width, item.lens.height)
+def _picture(item: PosedImage, room: list[int]) -> Shots:
+    _take(room, item.path, item.lens.width, item.lens.height)
     turned = is_turned(*image_head(item.path), (item.lens.width, item.lens.height))
     pixels = load_image(item.path, item.lens, turned=bool(turned))
     return item.world_to_camera, item.lens.undistorted(), [pixels[..., :3].contiguous()], 1.0
 
 
-def _film(file: Path, where: str, data: dict[str, Any], index: int, room: _Room) -> Shots:
+def _film(file: Path, where: str, data: dict[str, Any], index: int, room: list[int]) -> Shots:
     entry = data["frames"][index]
     path = check_regular(file.parent / str(entry["video_path"]), "the video")
     fps, begun, seconds = (read_number(where, entry, name) for name in ("fps", "begin", "seconds"))
@@ -198,9 +186,9 @@ def _film(file: Path, where: str, data: dict[str, Any], index: int, room: _Room)
         if not rate > 0:
             raise ValueError(f"The video {path} does not say its frame rate: add `fps` to its entry in {where}.")
         length = min(head["duration"] - (begun or 0), math.inf if seconds is None else seconds)
-        copy(room).take(path, *size, frames=int(head["fps"] * max(length, 0)))  # what it says; it may have more
+        _take(list(room), path, *size, frames=int(head["fps"] * max(length, 0)))  # what it says; it may have more
         for frame in film:
-            room.take(path, *size)
+            _take(room, path, *size)
             picture = torch.from_numpy(frame)
             images.append(remapped(picture, lens) if lens.distorted else picture)
     if not images and 0 < head["duration"] <= (begun or 0):
@@ -238,7 +226,10 @@ def frames_of(
     limits = ["-max_pixels", str(MOST_PIXELS)]
     try:
         with closing(read_frames(path, input_params=limits, output_params=["-frames:v", "1"])) as film:
-            rate = _rate(next(film)["fps"])
+            stated = next(film)["fps"]
+        television = Fraction(1000 * round(1.001 * stated), 1001)  # such as 24000/1001, which the head rounds to 23.98
+        rounded = stated != round(stated) and abs(television - stated) < 0.0051
+        rate = television if rounded else Fraction(stated).limit_denominator(100)
         steady = ["-r", str(rate)] if rate else []
         given: dict[str, Any] = {"input_params": [*limits, *inputs], "output_params": [*steady, *outputs]}
         with closing(read_frames(path, **given, **kind)) as film:
@@ -252,13 +243,6 @@ def frames_of(
             raise ValueError(f"The video {path} has more than {MOST_PIXELS:,} pixels: make it smaller.") from None
         told = str(error).splitlines()[0]
         raise ValueError(f"The video {path} cannot be read ({told}): convert it to mp4.") from error
-
-
-def _rate(stated: float) -> Fraction:
-    """The frame rate of a film, whose head rounds that of television, such as 24000/1001 to 23.98."""
-    television = Fraction(1000 * round(1.001 * stated), 1001)
-    rounded = stated != round(stated) and abs(television - stated) < 0.0051
-    return television if rounded else Fraction(stated).limit_denominator(100)
 
 
 def scaled(width: float | None, height: float | None) -> list[str]:

@@ -19,7 +19,7 @@ import gaussian_swaying
 from gaussian_swaying.cli.fit import main
 from gaussian_swaying.gaussians.formats import read_gaussians
 from gaussian_swaying.inverse import from_film
-from gaussian_swaying.inverse.from_film import Seen, extent, longest_side, open_film, plan_text
+from gaussian_swaying.inverse.from_film import extent, longest_side, open_film, plan_text
 from gaussian_swaying.inverse.plan import read_plan
 from gaussian_swaying.inverse.registration import painter_of
 from gaussian_swaying.inverse.report import HELD_TINT, MOVING
@@ -106,7 +106,7 @@ def test_a_film_that_does_not_say_its_length(case, checked, tmp_path):
 @pytest.fixture(scope="module")
 def seen(case):
     film, cloud, camera = open_film(case / "film.mp4"), read_gaussians(case / "my.ply", 0), camera_of(270, 480)
-    return Seen(film, cloud, camera, painter_of(cloud)(camera), 0.0), guess(cloud)
+    return cloud, camera, painter_of(cloud)(camera), film.full, guess(cloud)
 
 
 def test_known_lengths(seen):

@@ -8,7 +8,7 @@ from handheld_films import tripod, write_base
 from shared import value_error
 
 from gaussian_swaying.gaussians.parts import Part, Parts
-from gaussian_swaying.inverse.hand import Background
+from gaussian_swaying.inverse.registration import Background
 from gaussian_swaying.rendering.cameras.camera import project
 from gaussian_swaying.scenes import GivenScene
 from gaussian_swaying.simulation.body import Scene

@@ -75,7 +75,7 @@ def test_a_grid_on_which_the_scene_diverges_says_nothing(simulation, left, monke
 
     def lost(*given):
         calls.append(given)
-        return [(*key, torch.nan * own if len(calls) == 2 else own) for *key, own in pixels(*given)]
+        return [torch.nan * own if len(calls) == 2 else own for own in pixels(*given)]
 
     monkeypatch.setattr(module, "_pixels", lost)
     (part,) = trusted([left], [simulation, simulation], {}, left.video.times[:3])

@@ -7,8 +7,8 @@ import torch
 from handheld_films import drift, tripod, write_film
 from shared import peak, seeded, value_error
 
-from gaussian_swaying.inverse.hand import Background, gain_of, gains, prepared, with_gains
 from gaussian_swaying.inverse.plan import read_plan
+from gaussian_swaying.inverse.registration import Background, gain_of, gains, prepared, with_gains
 from gaussian_swaying.inverse.videos import Footage, read_videos
 
 pytest.importorskip("cv2", reason="needs the extra [fit]")

@@ -11,7 +11,7 @@ from shared import double, longest, value_error
 from small_films import TRUTH
 
 from gaussian_swaying.inverse.fit import fit
-from gaussian_swaying.inverse.hand import Background, follow_camera, moves_by, prepared
+from gaussian_swaying.inverse.registration import Background, follow_camera, moves_by, prepared
 from gaussian_swaying.inverse.tracks import track
 from gaussian_swaying.inverse.videos import Footage, read_videos
 from gaussian_swaying.rendering.cameras.camera import project

@@ -15,7 +15,7 @@ from gaussian_swaying.inverse.least_squares import (
     _beside,
     cost_of,
     covariance,
-    linearised,
+    normal,
     scale_of,
     solve,
 )
@@ -75,7 +75,7 @@ def test_standard_errors_are_the_scatter_of_repeated_fits():
         residuals = _decay([0.4, 0.3], noise)
         place = _solved(residuals, [0.5, 0.4]).place
         places.append(place)
-        errors.append(covariance(*linearised(residuals, place, estimated)).diagonal().sqrt())
+        errors.append(covariance(*normal(residuals, place, estimated)).diagonal().sqrt())
     scatter, told = torch.stack(places).std(0), torch.stack(errors).square().mean(0).sqrt()
     assert (told / scatter).tolist() == pytest.approx([1.0, 1.0], abs=0.3)
 
@@ -99,11 +99,11 @@ def test_sensitivities_are_exact_to_second_order_and_stay_in_the_range():
         weighed = places.square() * torch.tensor([1.0, 3.0])
         return Block(weighed[:, None], torch.zeros(1, dtype=torch.long))
 
-    matrix, scores = linearised(squares, double([0.5, 0.25]), scaled(1.0))
+    matrix, scores = normal(squares, double([0.5, 0.25]), scaled(1.0))
     assert matrix.diagonal().tolist() == pytest.approx([1.0, 1.5**2])
     assert scores[0].sum(0).tolist() == pytest.approx([0.25 * 1.0, 0.1875 * 1.5])
     assert _beside(double([0.0, 1.0]))[1].min() > 0
-    linearised(squares, double([0.0, 1.0]), scaled(1.0))
+    normal(squares, double([0.0, 1.0]), scaled(1.0))
 
 
 def valley(places):
@@ -193,7 +193,7 @@ def test_a_variant_that_diverges_is_no_end():
         return Block(values[:, :, None], torch.zeros(1, dtype=torch.long))
 
     assert float(_solved(lost, [0.1], scaled(1.0)).place) == pytest.approx(0.55, abs=1e-3)
-    for work in (lambda: _solved(lost, [0.7], scaled(1.0)), lambda: linearised(lost, double([0.7]), scaled(1.0))):
+    for work in (lambda: _solved(lost, [0.7], scaled(1.0)), lambda: normal(lost, double([0.7]), scaled(1.0))):
         with pytest.raises(DivergedError, match="Every simulation of a step diverged"):
             work()
 
@@ -204,7 +204,7 @@ def _mean(values, cluster, sigma, moment=None):
     def at(places):
         return Block((values.flatten() + places - 0.5)[..., None], cluster, moment)
 
-    return covariance(*linearised(at, double([0.5]), scaled(sigma)))
+    return covariance(*normal(at, double([0.5]), scaled(sigma)))
 
 
 @pytest.mark.parametrize("clusters", [1, 2, 5])

@@ -8,7 +8,7 @@ import torch
 from shared import value_error
 from small_films import changed
 
-from gaussian_swaying.inverse.plan import Unknown, apart_by, mirrored, mirrored_place, read_unknown
+from gaussian_swaying.inverse.plan import Unknown, apart_by, mirror_of, mirrored, read_unknown
 from gaussian_swaying.inverse.variants import check_variants
 from gaussian_swaying.wind.field import flow_of
 
@@ -88,13 +88,13 @@ def test_a_body_that_faces_all_ways_has_no_mirror_image(simulation):
 
 def test_the_mirrored_wind_lies_within_its_range(simulation):
     sought = [read_unknown("wind.azimuth", [-80.0, 160.0]), read_unknown("material.E", [1e3, 1e5])]
-    (other,) = mirrored_place(simulation.model, sought, [0.5, 0.95])
+    (other,) = mirror_of(simulation.model, sought, [0.5, 0.95])
     assert sought[0].value(other[0]) == pytest.approx(140.0, abs=3.0)
     assert other[1] == 0.95
     narrow = [read_unknown("wind.azimuth", [0.0, 90.0])]
-    assert mirrored_place(simulation.model, narrow, [0.5]) == []  # 135 degrees is known to be wrong
+    assert mirror_of(simulation.model, narrow, [0.5]) == []  # 135 degrees is known to be wrong
     around = [read_unknown("wind.azimuth", [150.0, 450.0])]
-    (again,) = mirrored_place(simulation.model, around, [0.6])  # 330 degrees is -30
+    (again,) = mirror_of(simulation.model, around, [0.6])  # 330 degrees is -30
     assert around[0].value(again[0]) == pytest.approx(210.0, abs=3.0)
 
 
@@ -103,7 +103,7 @@ def test_a_fit_tries_it_at_its_end(simulation, fit_of):
     made = fit_of({"wind.azimuth": [0.0, 180.0]})
     made._brief = lambda places, evidence, times: list(zip([1.0, 2.0], places[::-1], strict=True))
     (other,) = made.others([0.3], [])
-    assert other == made.values(mirrored_place(simulation.model, made.plan.unknowns, [0.3])[0])
+    assert other == made.values(mirror_of(simulation.model, made.plan.unknowns, [0.3])[0])
     assert other["wind.azimuth"] == pytest.approx(180 - 54, abs=3.0)
 
 
