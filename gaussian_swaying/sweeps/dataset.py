@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from numbers import Real
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
+from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from gaussian_swaying._checks import check_whole
 from gaussian_swaying._files import atomic, remove_temporaries, write_json, write_table
@@ -20,7 +22,6 @@ from gaussian_swaying.recording.checkpoint import first_change
 from gaussian_swaying.recording.nodes import load_nodes
 from gaussian_swaying.recording.trajectory import load_trajectory
 from gaussian_swaying.runs.folder import claim_folder, hold_folder
-from gaussian_swaying.runs.lock import FolderLock
 from gaussian_swaying.sweeps.plan import Plan
 
 SWEEP, TABLE, PARQUET = "sweep.json", "sweep.csv", "sweep.parquet"
@@ -38,10 +39,9 @@ ENERGIES = ("kinetic", "elastic", "potential")
 SUMMARY = (*FIGURES, *(f"{name}_end_J" for name in ENERGIES), "warnings")
 
 
-def open_folder(folder: Path, plan: Plan, resume: bool, together: int = 1) -> FolderLock:
-    """Make the folder of a sweep, or check the one that is continued; returns its lock, to be released at the end."""
-    import yaml
-
+@contextmanager
+def open_folder(folder: Path, plan: Plan, resume: bool, together: int = 1) -> Iterator[None]:
+    """Make the folder of a sweep, or check the one that is continued, and lock it inside the block."""
     held, remedy = (folder / SWEEP).exists(), "choose another with --output"
     if resume and not held:
         raise ValueError(f"There is nothing to resume in {folder}: it has no {SWEEP}; leave out --resume.")
@@ -64,10 +64,9 @@ def open_folder(folder: Path, plan: Plan, resume: bool, together: int = 1) -> Fo
             write_json(folder / SWEEP, new)
         for name in (RUNS, RESULTS, LOGS):
             (folder / name).mkdir(exist_ok=True)
-    except BaseException:
+        yield
+    finally:
         lock.release()
-        raise
-    return lock
 
 
 def read_record(folder: Path) -> dict[str, Any]:
@@ -80,21 +79,18 @@ def read_record(folder: Path) -> dict[str, Any]:
     return record
 
 
-def result_file(folder: Path, name: str) -> Path:
-    """The result of a run."""
-    return folder / RESULTS / f"{name}.json"
-
-
-def read_result(folder: Path, name: str) -> dict[str, Any] | None:
-    """The result of a run; None if it has not ended."""
-    if not (path := result_file(folder, name)).exists():
-        return None
-    result = None
-    with suppress(ValueError):
-        result = read_json(path, "result")
-    if not isinstance(result, dict) or not isinstance(result.get("status"), str):
-        raise ValueError(f"{path} is damaged: remove it, and --resume does its run again.")
-    return result
+def read_results(folder: Path, names: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """The results of those runs that have ended, by name."""
+    found = {}
+    for path in (folder / RESULTS / f"{name}.json" for name in names):
+        if path.exists():
+            result = None
+            with suppress(ValueError):
+                result = read_json(path, "result")
+            if not isinstance(result, dict) or not isinstance(result.get("status"), str):
+                raise ValueError(f"{path} is damaged: remove it, and --resume does its run again.")
+            found[path.stem] = result
+    return found
 
 
 def result_of(summary: Mapping[str, Any], attempt: int, where: str) -> dict[str, Any]:
@@ -122,10 +118,11 @@ def write_tables(folder: Path, plan: Plan, results: Mapping[str, Any], parquet: 
         texts = {"status", "reason"}.union(
             name for row in rows for name, value in row.items() if isinstance(value, dict | str)
         )
-        columns = {name: [_cell(row[name]) if name in texts else row[name] for row in rows] for name in rows[0]}
-        kinds = {name: pyarrow.string() if name in texts else None for name in columns}
+        table = {}
+        for name in rows[0]:
+            values = [_cell(row[name]) if name in texts else row[name] for row in rows]
+            table[name] = pyarrow.array(values, pyarrow.string() if name in texts else None)
         with atomic(folder / PARQUET) as temporary:
-            table = {name: pyarrow.array(values, kinds[name]) for name, values in columns.items()}
             pyarrow.parquet.write_table(pyarrow.table(table), temporary)
 
 
@@ -157,8 +154,8 @@ def write_shards(
     check_whole("runs_per_shard", runs_per_shard, 1)
     folder = Path(folder)
     runs = {f"{number:05d}": run for number, run in enumerate(read_record(folder)["runs"])}
-    ended = {name: read_result(folder, name) for name in runs}
-    done = {name: result["figures"] for name, result in ended.items() if result and result["status"] == "complete"}
+    ended = read_results(folder, runs)
+    done = {name: result["figures"] for name, result in ended.items() if result["status"] == "complete"}
     if not done:
         raise ValueError(f"No run of the sweep in {folder} is complete: finish it with --resume.")
     flat = {name: {axis: _numbers(value) for axis, value in runs[name].items()} for name in done}
@@ -213,8 +210,6 @@ def _pictures(folder: Path, run: str) -> list[Path]:
 
 def write_contact_sheet(folder: Path, plan: Plan, results: Mapping[str, Any]) -> None:
     """Write ``contact_sheet.png``: the last frame of each run, of the first 200, above its values."""
-    from PIL import Image, ImageDraw, ImageFont, ImageOps
-
     shown = dict(zip(plan.names[:MOST_SHOWN], plan.runs, strict=False))
     across = max(1, round(math.sqrt(1.2 * len(shown))))
     side, step = WIDTH + GAP, HEIGHT + BAND + GAP

@@ -142,21 +142,14 @@ def read_sweep(
     """The plan of a sweep file, which docs/many.md describes; ``find`` gives the file of a name in ``base``."""
     file = Path(path)
     given = read_fields(file, "the sweep file", FIELDS)
-    base = given.get("base")
-    base = [base] if isinstance(base, str) else base
+    base = [given["base"]] if isinstance(given.get("base"), str) else given.get("base")
     if not isinstance(base, list) or not base or not all(isinstance(name, str) for name in base):
-        raise ValueError(
-            f"Expected `base` in {file} to be a configuration of `sim` or a list of them, but got {base!r}: set it to "
-            "a file or a shipped name such as flag."
-        )
+        raise ValueError(f"Expected `base` in {file} to be a file or a shipped name such as flag, but got {base!r}.")
     settings, axes = (_options(file, name, given.get(name)) for name in ("settings", "axes"))
     if not axes:
-        raise ValueError(
-            f"Expected `axes` in {file} to have at least one option that differs between the runs: add it."
-        )
-    for name in axes:
-        if name in settings:
-            raise ValueError(f"`{name}` is in `settings` and in `axes` of {file}: remove one of the two.")
+        raise ValueError(f"Expected `axes` in {file} to have an option that differs between the runs: add it.")
+    for name in axes.keys() & settings.keys():
+        raise ValueError(f"`{name}` is in `settings` and in `axes` of {file}: remove one of the two.")
     draws, seed = given.get("draws", 1), given.get("seed", 0)
     check_whole("draws", draws, 1)
     check_whole("seed", seed, -(1 << 63))
@@ -211,9 +204,7 @@ def _telling(runs: Sequence[Mapping[str, Any]]) -> list[int]:
 def _options(file: Path, field_: str, given: Any) -> dict[str, Any]:
     given = {} if given is None else given
     if not isinstance(given, dict) or not all(isinstance(name, str) for name in given):
-        raise ValueError(
-            f"Expected `{field_}` in {file} to have options of `sim` as names (wind.flow), but got {given!r:.60}."
-        )
+        raise ValueError(f"Expected `{field_}` in {file} to name options of `sim` (wind.flow), but got {given!r:.60}.")
     for name in given:
         if name in NOT_HERE or name.startswith("-"):
             raise ValueError(

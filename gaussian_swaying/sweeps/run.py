@@ -14,9 +14,9 @@ import threading
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
-from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.util import find_spec
@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+import yaml
 from loky import ProcessPoolExecutor
 from loky.backend import resource_tracker
 from tqdm import tqdm
@@ -38,10 +39,10 @@ from gaussian_swaying.simulation.model import POLAR, find, number
 from gaussian_swaying.simulation.simulation import Simulation, run_batch
 from gaussian_swaying.sweeps.dataset import (
     LOGS,
+    RESULTS,
     RUNS,
     open_folder,
-    read_result,
-    result_file,
+    read_results,
     result_of,
     write_contact_sheet,
     write_tables,
@@ -54,7 +55,6 @@ if TYPE_CHECKING:
 KILLED = 3  # times as many retries for a job whose process was killed, as the reason may be outside of it
 LOCKED_S = 60.0  # how long to wait for a folder: the worker of a driver that was killed ends at its frame
 STOP_S = 300.0  # how long workers may take to write what they have when the sweep is stopped
-LOCAL = "local"
 EXTRAS = {"ray": ("ray", "ray"), "parquet": ("parquet", "pyarrow"), "shards": ("webdataset", "webdataset")}
 Explain = Callable[[BaseException], str]
 
@@ -81,13 +81,6 @@ class Job:
     def wanted(self) -> tuple[str, ...]:
         return tuple(name for name in self.names if name not in self.complete)
 
-    def failure(self, status: str, reason: str) -> dict[str, Any]:
-        return {"status": status, "reason": reason, "attempts": self.attempt}
-
-    def apart(self) -> list[Job]:
-        pairs = zip(self.names, self.runs, strict=True)
-        return [replace(self, names=(n,), runs=(r,), attempt=1) for n, r in pairs if n not in self.complete]
-
 
 @dataclass(frozen=True)
 class Outcome:
@@ -111,10 +104,18 @@ def work(job: Job, threads: int, explain: Explain, where: str = platform.node())
     told, status, ready = io.StringIO(), "failed", True
     try:
         with stop_signals(), redirect_stdout(told), redirect_stderr(told):
-            summaries = run_alone(job) if len(job.names) == 1 else run_together(job)
+            begin, do = time.monotonic(), run_alone if len(job.names) == 1 else run_together
+            while True:
+                try:
+                    summaries = do(job)
+                    break
+                except FolderLocked:
+                    if time.monotonic() - begin > LOCKED_S:
+                        raise
+                    time.sleep(0.5)
             results = {name: result_of(summary, job.attempt, where) for name, summary in summaries.items()}
             for name, result in results.items():
-                write_json(result_file(job.folder, name), result)
+                write_json(job.folder / RESULTS / f"{name}.json", result)
         return Outcome(results)
     except KeyboardInterrupt as stop:
         reason, ready = f"It was stopped ({stop or 'Ctrl-C'}).", False
@@ -129,25 +130,16 @@ def work(job: Job, threads: int, explain: Explain, where: str = platform.node())
             if told.getvalue():
                 with (job.folder / LOGS / f"{job.names[0]}.txt").open("a", encoding="utf-8") as file:
                     file.write(told.getvalue())
-    return Outcome(dict.fromkeys(job.wanted, job.failure(status, reason)), ready=ready)
+    result = {"status": status, "reason": reason, "attempts": job.attempt}
+    return Outcome(dict.fromkeys(job.wanted, result), ready=ready)
 
 
 def _lost(job: Job, reason: str) -> Outcome:
     """The outcome of a job whose process was killed, maybe after its last step."""
-    lost, done = job.failure("failed", reason), {name: read_result(job.folder, name) for name in job.wanted}
-    found = {name: own if own and own["status"] == "complete" else lost for name, own in done.items()}
+    lost = {"status": "failed", "reason": reason, "attempts": job.attempt}
+    done = read_results(job.folder, job.wanted)
+    found = {name: done[name] if done.get(name, lost)["status"] == "complete" else lost for name in job.wanted}
     return Outcome(found, killed=True, ready=False)
-
-
-def _unlocked(do: Callable[[], Any]) -> Any:
-    begin = time.monotonic()
-    while True:
-        try:
-            return do()
-        except FolderLocked:
-            if time.monotonic() - begin > LOCKED_S:
-                raise
-            time.sleep(0.5)
 
 
 def _first_of(job: Job) -> Simulation:
@@ -160,18 +152,14 @@ def run_alone(job: Job) -> dict[str, dict[str, Any]]:
     """Do the only run of a job; returns its summary by name."""
     (name,), (run,) = job.names, job.runs
     folder, extra, simulation = job.folder / RUNS / name, {"sweep": {"run": name, "settings": run}}, _first_of(job)
-
-    def once() -> dict[str, Any]:
-        if job.resume and (folder / "checkpoint.pt").exists():
-            try:
-                return simulation.run(folder, None, True, extra, progress=False)
-            except FolderLocked:
-                raise
-            except ValueError as error:  # it was killed after the last frame, or a file is damaged
-                print(f"{error} The run starts again.")
-        return simulation.run(folder, None, False, extra, progress=False)
-
-    return {name: _unlocked(once)}
+    if job.resume and (folder / "checkpoint.pt").exists():
+        try:
+            return {name: simulation.run(folder, None, True, extra, progress=False)}
+        except FolderLocked:
+            raise
+        except ValueError as error:  # it was killed after the last frame, or a file is damaged
+            print(f"{error} The run starts again.")
+    return {name: simulation.run(folder, None, False, extra, progress=False)}
 
 
 def shares_rollout(name: str) -> bool:
@@ -199,14 +187,12 @@ def run_together(job: Job) -> dict[str, dict[str, Any]]:
     members = members_of(job)
     folders = [None if name in job.complete else job.folder / RUNS / name for name in job.names]
     extras = [{"sweep": {"run": n, "settings": r}} for n, r in zip(job.names, job.runs, strict=True)]
-    summaries = _unlocked(lambda: run_batch(members, folders, members[0].frames_wanted, extras))
+    summaries = run_batch(members, folders, members[0].frames_wanted, extras)
     return {name: summary for name, summary in zip(job.names, summaries, strict=True) if summary is not None}
 
 
 def members_of(job: Job) -> list[Simulation]:
     """Simulations of all runs of a job; only the first is parsed, as that takes longer than a frame."""
-    import yaml
-
     first = _first_of(job)
     first.start()  # with all checks of a run
     content, members = yaml.safe_load(first.config), [first]
@@ -240,12 +226,18 @@ class Processes:
             if self.gpus:
                 environment["CUDA_VISIBLE_DEVICES"] = self.gpus[place % len(self.gpus)]
             self._executors[place] = ProcessPoolExecutor(1, env=environment, initializer=_end_with_parent)
+        blocked = hasattr(signal, "pthread_sigmask")  # not on Windows: Ctrl-C is for the driver alone
+        if blocked:
+            resource_tracker.ensure_running()  # otherwise the first start does, which unblocks Ctrl-C
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            with _without_ctrl_c():
-                future = self._executors[place].submit(work, job, self.threads, self.explain)
+            future = self._executors[place].submit(work, job, self.threads, self.explain)
         except BrokenExecutor as error:  # it was killed while it had nothing to do
             future = Future()
             future.set_exception(error)
+        finally:
+            if blocked:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
         self._places[future] = place
         return future
 
@@ -257,29 +249,23 @@ class Processes:
             outcome = future.result()
         except BrokenExecutor as error:
             code = (re.findall(r"\{(.*)\}", str(error)) or ["by itself"])[0]
-            outcome = _lost(
-                job,
-                f"Its process was ended ({code}), as the system does if memory runs out: use fewer `--workers`, or "
-                "--resume if someone else ended it.",
-            )
+            told = f"Its process was ended ({code}), as if memory ran out: use fewer `--workers`, or --resume."
+            outcome = _lost(job, told)
         if not outcome.ready:
             self._executors.pop(place).shutdown(kill_workers=True)
         return outcome
 
-    def close(self) -> None:
-        for executor in self._executors.values():
-            executor.shutdown()
-
-    def stop(self) -> None:
-        """Let all jobs end in order, at a frame; an impatient second Ctrl-C kills them."""
+    def close(self, stopped: bool = False) -> None:
+        """End the processes; if stopped, when their jobs are at a frame, and an impatient second Ctrl-C kills them."""
         try:
-            for executor in self._executors.values():
+            for executor in self._executors.values() if stopped else ():
                 for process in list(executor._processes.values()):
                     process.terminate()
-            wait(self._places, STOP_S)
+            if stopped:
+                wait(self._places, STOP_S)
         finally:
             for executor in self._executors.values():
-                executor.shutdown(kill_workers=True)
+                executor.shutdown(kill_workers=stopped)
 
 
 def _end_with_parent() -> None:
@@ -294,19 +280,6 @@ def _end_with_parent() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-@contextmanager
-def _without_ctrl_c() -> Iterator[None]:
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
-        yield
-        return
-    resource_tracker.ensure_running()  # otherwise the first start does, which unblocks Ctrl-C
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
 class Ray:
     """Does jobs as Ray tasks, as :class:`Processes` does, as many as there is room for if ``workers`` is None.
 
@@ -319,9 +292,9 @@ class Ray:
         self._ray: Any = ray
         self._ours = not ray.is_initialized()
         if self._ours:
-            given: dict[str, Any] = {"num_cpus": workers * threads} if address == LOCAL and workers else {}
+            given: dict[str, Any] = {"num_cpus": workers * threads} if address == "local" and workers else {}
             try:
-                ray.init(address=None if address == LOCAL else address, log_to_driver=False, **given)
+                ray.init(address=None if address == "local" else address, log_to_driver=False, **given)
             except (ConnectionError, RuntimeError, ValueError) as error:
                 told = first_line(error)
                 raise ValueError(f"There is no Ray cluster at {address} ({told}): check `--ray`.") from error
@@ -345,17 +318,15 @@ class Ray:
             told = first_line(error)[:200]
             return _lost(job, f"Ray ended its process ({told}): use fewer `--workers` if it was memory, or --resume.")
 
-    def stop(self) -> None:
+    def close(self, stopped: bool = False) -> None:
         try:
-            for reference in self._references.values():
+            for reference in self._references.values() if stopped else ():
                 self._ray.cancel(reference)
-            wait(self._references, STOP_S)
+            if stopped:
+                wait(self._references, STOP_S)
         finally:
-            self.close()
-
-    def close(self) -> None:
-        if self._ours:
-            self._ray.shutdown()
+            if self._ours:
+                self._ray.shutdown()
 
 
 def _task(job: Job, threads: int, explain: Explain, folder: str, path: list[str]) -> Outcome:
@@ -392,12 +363,13 @@ def drive(
                     again = outcome.killed or job.attempt == 1
                     waiting.append(replace(job, attempt=job.attempt + 1, resume=again))
                 elif failed and several:
-                    waiting.extend(job.apart())
+                    alone = ((n, r) for n, r in zip(job.names, job.runs, strict=True) if n in job.wanted)
+                    waiting.extend(replace(job, names=(n,), runs=(r,), attempt=1) for n, r in alone)
                 else:
                     for name in job.wanted:
                         ended(name, outcome.results[name])
     except BaseException:
-        pool.stop()
+        pool.close(stopped=True)
         raise
     pool.close()
 
@@ -431,15 +403,13 @@ def run_sweep(
     """
     folder = Path(output).absolute()
     check_choice("device", device, ("auto", "cpu", "cuda"))
-    check_whole("retries", retries, 0)
-    for name, given in (("workers", workers), ("threads", threads), ("together", together)):
+    for name, given in (("retries", retries), ("workers", workers), ("threads", threads), ("together", together)):
         if given is not None:
-            check_whole(name, given, 1)
+            check_whole(name, given, 0 if name == "retries" else 1)
     for option in (["ray"] if ray is not None else []) + (["parquet"] if parquet else []):
         check_extra(option)
-    lock = open_folder(folder, plan, resume, together)
-    try:
-        results = {name: result for name in plan.names if (result := read_result(folder, name)) is not None}
+    with open_folder(folder, plan, resume, together):
+        results = read_results(folder, plan.names)
         done = frozenset(name for name, result in results.items() if result["status"] == "complete")
         jobs = []
         for group in grouped(plan.runs, together):
@@ -453,7 +423,7 @@ def run_sweep(
             results[name] = result
             if result["status"] != "complete":  # a complete run has written its own
                 with suppress(OSError):  # a full disk
-                    write_json(result_file(folder, name), result)
+                    write_json(folder / RESULTS / f"{name}.json", result)
                 if progress:
                     tqdm.write(f"run {name} {result['status']}: {result['reason']}", file=sys.stderr)
             bar.update()
@@ -471,14 +441,10 @@ def run_sweep(
                 drive(jobs, Processes(workers, threads, explain, gpus), ended, retries)
         finally:
             bar.close()
-            for name in plan.names:  # some may have ended while the sweep was being stopped
-                if (result := read_result(folder, name)) is not None:
-                    results[name] = result
+            results |= read_results(folder, plan.names)  # some may have ended while the sweep was being stopped
             write_tables(folder, plan, results, parquet)
         write_contact_sheet(folder, plan, results)
         return results
-    finally:
-        lock.release()
 
 
 def check_extra(option: str) -> None:
