@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gaussian_swaying.inverse.registration import LEAST, SOLID, Registration, grey_of, refine
-from gaussian_swaying.inverse.tracks import STILL, corners, follow, opencv
+from gaussian_swaying.inverse.registration import LEAST, SOLID, Beside, Registration, grey_of, refine
+from gaussian_swaying.inverse.tracks import STILL, corners, drawn_beside, follow, opencv
 from gaussian_swaying.inverse.videos import Footage
 from gaussian_swaying.rendering.cameras.camera import Camera
 from gaussian_swaying.rendering.protocol import RenderOutput
@@ -54,6 +55,11 @@ class Background:
         simulated, named, _ = (drawn > SHARE).cpu().unbind(-1)
         return picture, (picture.alpha[..., 0].cpu() > SOLID) & ~_widened(simulated) & ~named
 
+    def beside(self, camera: Camera, pixel: Any) -> Any:
+        """How far the picture shows things beside where they are, at pixels, NumPy array, shape (N, 2)."""
+        device = self._painter.device
+        return drawn_beside(self._painter, self._rest, camera.to(device), torch.from_numpy(pixel)).numpy()
+
 
 def _widened(moving: Tensor) -> Tensor:
     cv2 = opencv()
@@ -90,20 +96,25 @@ def follow_camera(
 ) -> tuple[Footage, tuple[int, ...], float]:
     """The video with the camera of each frame, from that of the first frame.
 
+    The first frame tells by what fits better whether the film shows things where they are, or where the splat is drawn.
     Frames that show too little of the background are listed, and have a camera between those of their neighbours. The
     number is the median distance of points that agree [pixels].
     """
     found: list[Registration | None] = []
     camera = video.cameras[0]
+    ways: tuple[Beside | None, ...] = (None, background.beside)
     for image in video.images:
         seen = None
         for _ in range(DRAWN if found else FIRST):
             picture, still = background.draw(camera)
-            seen = refine(image, picture, camera, still)
+            tried = {way: refine(image, picture, camera, still, way) for way in ways}
+            seen = min(filter(None, tried.values()), key=lambda one: one.residual, default=None)
             if seen is None or seen.agreeing < AGREE * seen.matches:
                 seen = None
                 break
             camera = seen.camera
+        if seen is not None:
+            ways = tuple(way for way in ways if tried[way] is seen)
         found.append(seen)
         tick(1)
     unseen = tuple(k for k, camera in enumerate(found) if camera is None)

@@ -37,6 +37,7 @@ LARGER, ASIDE = 1.08, 10.0  # ratio of distances, and angle [degrees], from whic
 PICTURE, CAMERAS = "registration.png", "transforms.json"
 STILLS = (".png", ".jpg", ".jpeg")
 Draw = Callable[[Camera], RenderOutput]  # draws the splat, at rest
+Beside = Callable[[Camera, Any], Any]  # how far its picture shows things beside where they are, at pixels (N, 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,12 +134,14 @@ def find_camera(draw: Draw, frame: Tensor, start: Sequence[Camera], *, focal: bo
     return best
 
 
-def refine(frame: Tensor, picture: RenderOutput, camera: Camera, where: Tensor) -> Registration | None:
+def refine(
+    frame: Tensor, picture: RenderOutput, camera: Camera, where: Tensor, beside: Beside | None = None
+) -> Registration | None:
     """The camera of a frame from a picture from nearby, of whose pixels ``where`` (H, W) count; None if too few agree.
 
-    Most points may have moved by some 20 pixels.
+    Most points may have moved by some 20 pixels. A frame that shows things where they are needs ``beside``.
     """
-    return _by_flow(grey_of(frame), picture, camera, False, _near(camera), where)
+    return _by_flow(grey_of(frame), picture, camera, False, _near(camera), where, beside)
 
 
 def _near(camera: Camera) -> float:
@@ -207,8 +210,9 @@ def _by_features(
 
 
 def _by_flow(
-    grey: Any, picture: RenderOutput, camera: Camera, focal: bool, near: float = CLOSE, where: Tensor | None = None
-) -> Registration | None:
+    grey: Any, picture: RenderOutput, camera: Camera, focal: bool, near: float = CLOSE, where: Tensor | None = None,
+    beside: Beside | None = None,
+) -> Registration | None:  # fmt: skip
     cv2, drawn = opencv(), grey_of(picture.color)
     solid = picture.alpha[..., 0].detach().cpu().numpy() > SOLID
     solid = solid if where is None else solid & where.numpy()
@@ -217,7 +221,8 @@ def _by_flow(
     if len(here) < LEAST:
         return None
     (_, place), (_, seen) = follow(np.stack([drawn, grey]), here)
-    return _seen_from(picture, camera, here[seen], place[seen], focal, near)
+    there = place[seen] if beside is None else place[seen] + beside(camera, here[seen])
+    return _seen_from(picture, camera, here[seen], there, focal, near)
 
 
 def _seen_from(
