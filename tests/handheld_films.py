@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gaussian_swaying.gaussians.ply import write_ply
 from gaussian_swaying.rendering.cameras.camera import Camera, look_at_camera
+from gaussian_swaying.scenes.printed_cloth import printed_colours
 from gaussian_swaying.scenes.procedural import FlagScene, both
 from gaussian_swaying.simulation.simulation import Simulation
 
@@ -48,6 +49,24 @@ def drift(frames: int) -> Tensor:
     way = torch.linspace(0, 1, frames, dtype=torch.float64)[:, None]
     ripple = 0.02 * torch.sin(2 * math.pi * 4 * way)
     return 1 + way * torch.tensor([-0.15, -0.25, -0.35], dtype=torch.float64) + ripple
+
+
+def photographed(camera: Camera, walls: Sequence[tuple[float, float, float, tuple[float, ...]]] = WALLS) -> Tensor:
+    """The walls themselves, by three rays a pixel and side and not as Gaussians, black elsewhere, uint8, (H, W, 3)."""
+    rows, columns = ((torch.arange(3 * n) + 0.5).double() / 3 for n in (camera.height, camera.width))
+    row, column = torch.meshgrid(rows, columns, indexing="ij")
+    local = torch.stack([column, row, torch.ones_like(row)], -1) @ camera.intrinsics.double().inverse().T
+    ray, eye = local @ camera.world_to_camera[:3, :3].double(), camera.position.double()
+    nearest, colour = torch.full_like(row, math.inf), torch.zeros_like(ray)
+    for width, height, yaw, corner in walls:
+        turn, first = math.radians(yaw), eye.new_tensor(corner)
+        along, normal = eye.new_tensor([[math.cos(turn), math.sin(turn), 0], [-math.sin(turn), math.cos(turn), 0]])
+        distance = (first - eye) @ normal / (ray @ normal)
+        place = eye + distance[..., None] * ray - first
+        x, z = place @ along, place[..., 2]
+        seen = (distance > 0) & (distance < nearest) & (x > 0) & (x < width) & (z > 0) & (z < height)
+        nearest[seen], colour[seen] = distance[seen], printed_colours(x[seen], z[seen]).double()
+    return (255 * colour.unflatten(0, (-1, 3)).unflatten(2, (-1, 3)).mean((1, 3))).round().to(torch.uint8)
 
 
 def write_film(

@@ -14,7 +14,7 @@ from copy import copy
 from dataclasses import dataclass, field, replace
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -35,15 +35,11 @@ from gaussian_swaying.runs.folder import MARKER, claim_folder, hold_folder
 from gaussian_swaying.simulation.measure import duration
 from gaussian_swaying.simulation.simulation import Simulation
 
-if TYPE_CHECKING:
-    from jsonargparse import ArgumentParser, Namespace
-
 PROGRESS, FORMAT = "fit.json", 2
 OURS = (PROGRESS, "page.html", "values.csv", "result.json", "scene.yaml", PICTURES)
 UNSETTLED = "The values have not settled: `iterations` ran out: raise it and continue with --resume."
-FOLLOWED = 0.5  # share of the frames in which points are followed; chaos grows with time
 STEPS = (0.5, 0.5, 0.75, 1.0, 1.0)  # shares in which Gaussians are matched from rendered frames
-STARTS, SEARCHED, COARSE = 3, 0.5, 0.02  # starts, share of the frames, and residuals per picture, of the search
+STARTS, SEARCHED, COARSE = 3, 0.5, 0.02  # starts, share of the frames, as chaos grows, and residuals per picture
 LONG_STILL = 0.05  # longest time that a film may be still, if the start of its motion is no unknown [s]
 SPREAD = ("wind.speed", "wind.azimuth", "material.E")  # searched although a start was given
 APART, SAME = 0.15, 0.03  # least distance of starts, and largest of ends that are the same, as shares of a range
@@ -224,7 +220,7 @@ class Problem:
 
     def best_of(self, places: Sequence[Sequence[float]]) -> list[list[float]]:
         """Solve from several starts for a short while, and return the best end, and another with nearly its cost."""
-        times = self._until(FOLLOWED)
+        times = self._until(SEARCHED)
         ended = self._brief(places, self.evidence(), times)
         for cost, place in ended:
             self.say(f"start to {times[-1]:.3g} s: cost {cost:.3g}, {self._shown(place)}")
@@ -452,7 +448,8 @@ def check_fit(plan: Plan, output: str | os.PathLike[str], *, device: str = "auto
     return write_before(Path(output), problem.tracks)
 
 
-def _ready(plan: Plan, device: str, progress: bool) -> tuple[Problem, ArgumentParser, Namespace]:
+def _ready(plan: Plan, device: str, progress: bool) -> tuple[Problem, Any, Any]:
+    """The problem, and the parser and the settings of its simulation."""
     opencv()  # before anything that takes time
     parser = Simulation.parser()
     files = [word for name in plan.base for word in ("--config", name)]

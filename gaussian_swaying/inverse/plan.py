@@ -226,18 +226,15 @@ def make_plan(given: Mapping[str, Any], where: str, find: Callable[[str], str] =
             f"{sought!r:.60}."
         )
 
-    def beside(value: Any) -> Any:
-        there = isinstance(value, str) and (folder / value).exists()
-        return str(folder / value) if there else value
-
     for name in ("base", "videos"):
         if not own.get(name):
             raise ValueError(f"Expected `{name}` in {where} to be a name or a list of names: add it.")
-    base = [beside(name) if (folder / name).exists() else find(name) for name in own.pop("base")]
+    base = [str(folder / name) if (folder / name).exists() else find(name) for name in own.pop("base")]
     import_forces(base)
     videos = [str(folder / name) for name in own.pop("videos")]
     unknowns = [read_unknown(name, entry) for name, entry in sought.items()]
-    return Plan(base, videos, unknowns, {name: beside(value) for name, value in known.items()}, **own)
+    files = {n: str(folder / v) for n, v in known.items() if isinstance(v, str) and (folder / v).exists()}
+    return Plan(base, videos, unknowns, known | files, **own)
 
 
 def read_unknown(name: str, given: Any) -> Unknown:

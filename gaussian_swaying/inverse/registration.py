@@ -20,7 +20,7 @@ from gaussian_swaying.gaussians.measures import Gaussians
 from gaussian_swaying.geometry.covariances import covariance
 from gaussian_swaying.geometry.origin import Origin
 from gaussian_swaying.inverse.plan import FILM_START
-from gaussian_swaying.inverse.tracks import ALIKE, GREY, STILL, alike, corners, follow, opencv, picture_of
+from gaussian_swaying.inverse.tracks import ALIKE, GREY, STILL, alike, corners, drawn_beside, follow, opencv, picture_of
 from gaussian_swaying.inverse.videos import Footage
 from gaussian_swaying.rendering.cameras.camera import Camera, orbit_camera
 from gaussian_swaying.rendering.gsplat_renderer import make_renderer
@@ -199,11 +199,13 @@ def _by_features(
 
 
 def by_flow(
-    grey: Any, picture: RenderOutput, camera: Camera, focal: bool = False, near: float = 0, where: Tensor | None = None
-) -> Registration | None:
+    grey: Any, picture: RenderOutput, camera: Camera, focal: bool = False, near: float = 0, where: Tensor | None = None,
+    beside: Callable[[Camera, Any], Any] | None = None,
+) -> Registration | None:  # fmt: skip
     """The camera of a frame, as :func:`grey_of` has it, from a picture from nearby; None if too few points agree.
 
-    Most points may have moved by some 20 pixels. Only pixels ``where`` (H, W) count; ``near`` 0 is what is usual.
+    Most points may have moved by some 20 pixels. Only pixels ``where`` (H, W) count; ``near`` 0 is what is usual. A
+    frame that shows things where they are needs ``beside``.
     """
     cv2, drawn = opencv(), grey_of(picture.color)
     solid = picture.alpha[..., 0].detach().cpu().numpy() > SOLID
@@ -213,7 +215,8 @@ def by_flow(
     if len(here) < LEAST:
         return None
     (_, place), (_, seen) = follow(np.stack([drawn, grey]), here)
-    return _seen_from(picture, camera, here[seen], place[seen], focal, near)
+    there = place[seen] if beside is None else place[seen] + beside(camera, here[seen])
+    return _seen_from(picture, camera, here[seen], there, focal, near)
 
 
 def _seen_from(
@@ -284,12 +287,13 @@ def first_look(simulation: Simulation, video: Footage, earliest: float | None) -
             "this splat, or find its camera with `gaussian-swaying camera FILM SPLAT` (its places may be in another "
             f"unit); if it begins in motion, add {FILM_START}: {{range: [-1, 0]}} to `unknowns`."
         )
+    if other is None and (earliest is not None or most <= AWAY):
+        return []
     if other is None:
-        told = (
+        return [
             f"The first frame of camera {video.name} is {most:.2g} pixels away from the splat at rest: the film begins "
             f"in motion. Add {FILM_START}: {{range: [-1, 0]}} to `unknowns`, or give a film that begins at rest."
-        )
-        return [told] if earliest is None and most > AWAY else []
+        ]
     middle = rest.means.double().cpu().mean(0)
     near, far = ((camera.position.double().cpu() - middle).norm() for camera in (other, given))
     larger = float(far / near)
@@ -335,6 +339,11 @@ class Background:
             simulated = torch.from_numpy(away) <= REACH * side
         return picture, (picture.alpha[..., 0].cpu() > SOLID) & ~simulated & ~named
 
+    def beside(self, camera: Camera, pixel: Any) -> Any:
+        """How far the picture shows things beside where they are, at pixels, NumPy array, shape (N, 2)."""
+        device = self._painter.device
+        return drawn_beside(self._painter, self._rest, camera.to(device), torch.from_numpy(pixel)).numpy()
+
 
 def moves_by(video: Footage, background: Background) -> float:
     """Distance that the background goes in the film of a camera that is said to stand still [pixels]; 0 if unknown.
@@ -362,27 +371,30 @@ def follow_camera(
 ) -> tuple[Footage, tuple[int, ...], float]:
     """The video with the camera of each frame, from that of the first frame.
 
+    The first frame tells by what fits better whether the film shows things where they are, or where the splat is drawn.
     Frames that show too little of the background are listed, and have a camera between those of their neighbours. The
     number is the median distance of points that agree [pixels].
     """
     found: list[Registration | None] = []
-    camera = video.cameras[0]
+    camera, ways = video.cameras[0], [None, background.beside]
     for image in video.images:
         for _ in range(DRAWN if found else FIRST):
             picture, still = background.draw(camera)
-            seen = by_flow(grey_of(image), picture, camera, where=still)
+            tried = {way: by_flow(grey_of(image), picture, camera, where=still, beside=way) for way in ways}
+            seen = min(filter(None, tried.values()), key=lambda one: one.residual, default=None)
             if seen is None or seen.agreeing < AGREE * seen.matches:
                 seen = None
                 break
             camera = seen.camera
+        if seen is not None:
+            ways = [way for way in ways if tried[way] is seen]
         found.append(seen)
         tick(1)
     unseen = tuple(k for k, camera in enumerate(found) if camera is None)
     if 2 * len(unseen) > len(found):
         raise ValueError(
             f"The camera {video.name!r} moves, but {len(unseen)} of its {len(found)} frames show too little of what "
-            "stands still in the splat: stand it on a tripod, or film something still and textured, too, and have it "
-            "in the splat."
+            "stands still in the splat: stand it on a tripod, or film something still and textured, too."
         )
     seen_at = [(time, one) for time, one in zip(video.times, found, strict=True) if one is not None]
     moments, poses = [time for time, _ in seen_at], [one.camera.world_to_camera.double() for _, one in seen_at]
@@ -455,8 +467,7 @@ def prepared(
     if not background.exists:
         if hand_held:
             raise ValueError(
-                "`hand_held` needs something that stands still in the splat, but all of it moves: stand the camera on "
-                "a tripod, or have something still and textured, too, in the film and in the splat."
+                "`hand_held` needs something still and textured in the splat and in the film: use a tripod, or add it."
             )
         return list(videos), [], []
     found, told, doubts = [], list[str](), list[str]()

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 from bench.problems.films import shaken
-from handheld_films import drift, off, tripod, write_base, write_film
+from handheld_films import drift, off, photographed, tripod, write_base, write_film
 from shared import double, longest, value_error
 from small_films import TRUTH
 
 from gaussian_swaying.inverse.fit import fit
 from gaussian_swaying.inverse.registration import Background, follow_camera, moves_by, prepared
-from gaussian_swaying.inverse.tracks import track
+from gaussian_swaying.inverse.tracks import in_bytes, track
 from gaussian_swaying.inverse.videos import Footage, read_videos
 from gaussian_swaying.rendering.cameras.camera import project
 from gaussian_swaying.simulation.simulation import Simulation
@@ -59,6 +59,18 @@ def test_the_camera_of_each_frame_is_found(film, folder, simulation):
     assert unseen == ()
     assert residual < 0.4
     assert found.cameras[0].world_to_camera.dtype == video.cameras[0].world_to_camera.dtype
+
+
+@pytest.mark.parametrize("real", [True, False])
+def test_cameras_are_not_shifted_as_a_splat_shows_its_walls(real, tmp_path):
+    """By 0.7 pixels or more if a film of real walls counts as one of the splat, or the other way round."""
+    background = Background(Simulation.from_yaml(write_base(tmp_path, 0.01), device="cpu"))
+    true = shaken(tripod(WIDTH, HEIGHT), 4, 1.0)
+    drawn = [in_bytes(background.draw(camera)[0]) for camera in true]
+    images = torch.stack([photographed(camera) for camera in true] if real else drawn)
+    found, _, _ = follow_camera(Footage("hand", (0.0, 0.1, 0.2, 0.3), (true[0],) * 4, images), background)
+    shift = [project(AT, a)[0] - project(AT, b)[0] for a, b in zip(found.cameras, true, strict=True)]
+    assert longest(torch.stack(shift)) < (0.5 if real else 0.1)
 
 
 def test_only_the_camera_that_moves_is_seen_to_move(folder, simulation):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from handheld_films import photographed
 from shared import longest, near
 from small_films import cameras, changed
 
@@ -14,7 +15,6 @@ from gaussian_swaying.inverse.variants import states_of
 from gaussian_swaying.inverse.videos import Footage, read_videos
 from gaussian_swaying.rendering.cameras.camera import look_at_camera, project
 from gaussian_swaying.rendering.protocol import RenderOutput
-from gaussian_swaying.scenes.printed_cloth import printed_colours
 from gaussian_swaying.scenes.procedural import FlagScene
 
 cv2 = pytest.importorskip("cv2", reason="needs the extra [fit]")
@@ -94,19 +94,6 @@ def _printed(folder, spacing):
     return changed(folder, scene={"generator": {"class_path": "FlagScene", "init_args": flag}})
 
 
-def _photographed(camera, finer=3):
-    """A picture of the printed sheet itself, by rays and not as Gaussians, uint8, (H, W, 3)."""
-    rows, columns = ((torch.arange(n * finer) + 0.5).double() / finer for n in (camera.height, camera.width))
-    row, column = torch.meshgrid(rows, columns, indexing="ij")
-    local = torch.stack([column, row, torch.ones_like(row)], -1) @ camera.intrinsics.double().inverse().T
-    ray, eye = local @ camera.world_to_camera[:3, :3].double(), camera.position.double()
-    place = eye - (eye[1] / ray[..., 1])[..., None] * ray
-    x, _, z = place.unbind(-1)
-    seen, colour = (x > 0) & (x < 0.4) & (z > 0) & (z < 0.3), torch.zeros_like(ray)
-    colour[seen] = printed_colours(x[seen], z[seen]).double()
-    return (255 * colour.unflatten(0, (-1, finer)).unflatten(2, (-1, finer)).mean((1, 3))).round().to(torch.uint8)
-
-
 @pytest.mark.slow(gate=["False"])
 @pytest.mark.parametrize("real", [True, False])
 def test_matches_are_not_shifted_where_the_print_of_a_splat_is(real, tmp_path):
@@ -119,7 +106,7 @@ def test_matches_are_not_shifted_where_the_print_of_a_splat_is(real, tmp_path):
     views = [look_at_camera((0.2 + x, -0.5, 0.35), (0.2, 0.0, 0.15), (0, 0, 1), 45.0, 240, 180) for x in (-0.5, 0.5)]
     drawn = [painter.picture(gaussians, view).color.detach() for view in views]
     own = [(255 * picture.clamp(0, 1)).round().to(torch.uint8) for picture in drawn]
-    images = [_photographed(view) for view in views] if real else own
+    images = [photographed(view, [(0.4, 0.3, 0.0, (0.0, 0.0, 0.0))]) for view in views] if real else own
     rest = next(iter(states_of(simulation, [{}], [0.0])))[0]
     found = match(simulation, Footage("moved", (0.0, 0.1), tuple(views), torch.stack(images)), [rest, rest])
     means = simulation.scene.model.means.detach()[simulation.scene.moving[found.index]]
