@@ -131,10 +131,7 @@ def find_camera(draw: Draw, frame: Tensor, start: Sequence[Camera], *, focal: bo
     tried = [_by_features(sift, wanted, draw(camera), camera) for camera in start]
     best = max((one for one in tried if one is not None), key=lambda one: one.agreeing, default=None)
     if best is None:
-        raise ValueError(
-            "The splat was not found in the frame: give a camera that is nearer, a frame that shows more of it, or one "
-            "with more texture."
-        )
+        raise ValueError("The splat was not found in the frame: give a nearer camera, or a frame with more texture.")
     for _ in range(ROUNDS):
         best = _by_features(sift, wanted, draw(best.camera), best.camera, focal) or best
     for _ in range(ROUNDS if best.agreeing < ENOUGH else 0):
