@@ -2,8 +2,8 @@
 
 Rounding moves a Gaussian from one side of a threshold to the other, so counts may differ by half a percent, or by two;
 other numbers by half a percent of the largest of their list. Numbers that follow from linear algebra or a search for a
-typical stretch of wind may differ by 5 %, and that stretch is another one where two are equally typical. E of the biker,
-who is rigid, becomes 12.0 to 15.7 GPa by seven changes of the places by 1e-6 on an AMD EPYC.
+typical stretch of wind may differ by 5 %, and that stretch is another one where two are equally typical. Seven changes
+of the places by 1e-6 on an AMD EPYC make E of the biker, who is rigid, 12.0 to 15.7 GPa.
 """
 
 import json
