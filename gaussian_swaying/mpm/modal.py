@@ -13,7 +13,7 @@ The stiffness matrix of the ``total`` formulation at rest is constant, so a few 
 - **Modes.** Load-dependent Ritz vectors (Wilson, Yuan & Dickens 1982, Earthq. Eng. Struct. Dyn. 10:813) in place of
   eigenvectors: the answers to loads along three axes, on the whole and on clusters of points, and the answers to their
   inertia. Loose bits are left out: modes below :data:`LOOSE` of the first frequency, and those below the first
-  frequency in which less than :data:`BITS` of the mass moves.
+  frequency in which less than :data:`BITS` of the mass moves and the wind does less than :data:`IDLE` of its work.
 
 All results are for a body of 1 kg with a mean Young's modulus of 1 Pa, so that they serve for any factor of either.
 """
@@ -44,6 +44,8 @@ NEAR = (0.6, 1.5)
 """Frequencies over Rayleigh's quotient of the lean between which the first mode is looked for."""
 BITS = 0.03
 """Share of the mass that moves in a mode of a few bits, at most."""
+IDLE = 0.01
+"""Share of the work of a level wind that it does on a mode of loose bits, at most."""
 CLUSTERS = 24
 """Clusters of points that are loaded one by one."""
 STIFF_ROW = 1e4
@@ -54,7 +56,7 @@ MOST_UNKNOWNS = 150_000
 """A body with more is refused: its factor would fill the memory."""
 KEPT = 32
 """Analyses in the cache."""
-_VERSION = 9  # of the analysis, in the name of the file
+_VERSION = 10  # of the analysis, in the name of the file
 
 
 @dataclass(frozen=True)
@@ -335,7 +337,9 @@ class Structure:
         pull = modes.T @ whole
         main = min(_main(square, pull, first, share), key=lambda k: square[k])
         first = square[main]
-        loose = (square < LOOSE**2 * first) | ((square < first) & (share < BITS))
+        moved = pull**2 / square[:, None]
+        idle = (moved < IDLE * moved.sum(0)).all(1)  # one that shares the sway with a bit of the same frequency is not
+        loose = (square < LOOSE**2 * first) | ((square < first) & (share < BITS) & idle)
         chosen = np.flatnonzero(~loose)[:most]
         across = (pull @ [-pull[main, 1], pull[main, 0]])[chosen] ** 2 / square[chosen]
         second = int(np.where(chosen == main, 0.0, across).argmax())
