@@ -28,7 +28,7 @@ from gaussian_swaying.inverse.plan import FILM_START, Plan, apart_by, check_apar
 from gaussian_swaying.inverse.registration import first_look, prepared
 from gaussian_swaying.inverse.report import PICTURES, Fit, consequences, write_before, write_films, write_results
 from gaussian_swaying.inverse.tracks import Tracks, match, opencv, track
-from gaussian_swaying.inverse.variants import check_variants, compare, explained, split, states_of, trusted
+from gaussian_swaying.inverse.variants import check_variants, compare, explained, split, states_of, trusted, turning
 from gaussian_swaying.inverse.videos import Footage, frame_times, read_videos
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.runs.folder import MARKER, claim_folder, hold_folder
@@ -333,7 +333,7 @@ class Problem:
     def result(self, course: Mapping[str, Any], evidence: Sequence[Tracks], folder: Path | None) -> Fit:
         at = course["places"][-1]
         place, held = torch.tensor(at, dtype=torch.float64), [split(own)[1] for own in self.tracks]
-        values = self.values(at)
+        values, fast = self.values(at), turning(evidence, self.plan.unknowns, place, self.fitted)
         return Fit(
             self.plan.unknowns,
             tuple(at),
@@ -341,7 +341,7 @@ class Problem:
             course["history"],
             course["seconds"],
             "" if course["history"][-1]["ended"] else UNSETTLED,
-            tuple(self.notes()),
+            (*self.notes(), *fast),
             write_films(folder, held, values, self.times, len(self.fitted)) if folder else {},
             explained(held, values, self.fitted),
             consequences(self.plan.assumed, values, self.simulation),

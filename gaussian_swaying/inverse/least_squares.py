@@ -86,7 +86,7 @@ def solve(
         return (known[key].values[0].flatten()[used].double() / sigma).numpy()
 
     def slopes(shift: Any) -> Any:
-        both, widths = _beside(begin + torch.from_numpy(shift))
+        both, widths = beside(begin + torch.from_numpy(shift))
         high, low = (residuals(both).values.flatten(1)[:, used].double() / sigma).chunk(2)
         return torch.nan_to_num((high - low) / widths[:, None], posinf=0.0, neginf=0.0).T.numpy()
 
@@ -105,7 +105,7 @@ def solve(
     return Solved(end, block, now, NO_STEP if ended and torch.equal(end, begin) else ended, tried)
 
 
-def _beside(place: Tensor) -> tuple[Tensor, Tensor]:
+def beside(place: Tensor) -> tuple[Tensor, Tensor]:
     """Places on both sides of one in each unknown, shape (2U, U), and how far they are apart, (U,).
 
     One-sided differences bias the gradient: in a narrow valley, such as that of wind, stiffness and density raised
@@ -138,7 +138,7 @@ def normal(
 
     J^T W J, shape (U, U), and the parts of J^T W r of both kinds of clusters, each (C, U).
     """
-    both, widths = _beside(place)
+    both, widths = beside(place)
     block, unknowns = residuals(torch.cat([place[None], both])), len(place)
     sigma = scale(block)
     values = block.values.double() / sigma

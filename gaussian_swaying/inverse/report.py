@@ -76,20 +76,6 @@ class Fit:
         share = self.covariance.diagonal().clamp(min=0).sqrt().tolist()
         return {u.name: s * u.slope(p) for u, s, p in zip(self.unknowns, share, self.place, strict=True)}
 
-    @property
-    def vague(self) -> list[str]:
-        """Names of the unknowns that are not determined."""
-        found = []
-        for u, row in zip(self.unknowns, self.rows(), strict=True):
-            most = VAGUE * (abs(row["value"]) if u.scale == "log" else u.high - u.low)
-            most = min(most, TURNED) if u.unit == "degrees" else most
-            found += [u.name] if row["standard_error"] > most else []
-        return found
-
-    @property
-    def at_an_end(self) -> list[str]:
-        return [u.name for u, p in zip(self.unknowns, self.place, strict=True) if p < 1e-3 or p > 1 - 1e-3]
-
     def doubts(self) -> tuple[list[str], list[str]]:
         """Reasons for which the fit has failed, and for which it is doubtful, as sentences with a remedy."""
         failed: list[str] = []
@@ -112,12 +98,14 @@ class Fit:
                     f"so the values may be wrong. {CHECK}, or fit a shorter part (`until`)."
                 )
         doubtful += [self.unsettled] if self.unsettled else []
-        doubtful += [
-            f"{name} is not determined by this video: its error is large. Film longer or from one more side, or lower "
-            "`solver.dx`."
-            for name in self.vague
-        ]
-        doubtful += [f"{name} is at an end of its range: widen the range." for name in self.at_an_end]
+        for u, p, row in zip(self.unknowns, self.place, self.rows(), strict=True):
+            most = VAGUE * (abs(row["value"]) if u.scale == "log" else u.high - u.low)
+            if row["standard_error"] > (min(most, TURNED) if u.unit == "degrees" else most):
+                doubtful.append(
+                    f"{u.name} is not determined by this video: its error is large. Film longer or from one more side, "
+                    "or lower `solver.dx`."
+                )
+            doubtful += [] if 1e-3 <= p <= 1 - 1e-3 else [f"{u.name} is at an end of its range: widen the range."]
         return failed, doubtful
 
     @property

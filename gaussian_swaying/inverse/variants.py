@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._fixed import assign
-from gaussian_swaying.inverse.least_squares import Block
-from gaussian_swaying.inverse.plan import FILM_START, Unknown, Values, of_simulation
+from gaussian_swaying.inverse.least_squares import Block, beside
+from gaussian_swaying.inverse.plan import FILM_START, Unknown, Values, of_simulation, values_at
 from gaussian_swaying.inverse.tracks import Tracks
 from gaussian_swaying.mpm.state import State
 from gaussian_swaying.simulation.measure import SimulationDiverged
@@ -22,6 +22,7 @@ from gaussian_swaying.wind.force import with_added_mass
 
 MOMENTS = 4  # parts of the time: clusters
 NOISE = 0.5  # distance of a track that its own error explains [pixels]
+FAST = -0.5  # correlation from one frame to the next of a motion with a third of their rate
 HELD, LEAST_HELD = 7, 6  # one of so many tracks is not fitted, if there are at least so many of them
 
 
@@ -165,7 +166,7 @@ def explained(parts: Sequence[Tracks], values: Values, times: Sequence[float]) -
     A track that slipped off the object explains nothing, no less: one of them would decide the sum of all.
     """
     found = {}
-    for part, pixel in zip(parts, _pixels(parts, values, times), strict=True):
+    for part, pixel in zip(parts, pixels_of(parts, [values], times)[0], strict=True):
         there, seen = part.position[: len(pixel)], part.seen[: len(pixel)]
         left = ((pixel - there).square().sum(-1) - NOISE**2).clamp(min=0).nan_to_num(torch.inf)
         moved = (there - part.at_rest[: len(pixel)]).square().sum(-1)
@@ -193,20 +194,30 @@ def trusted(
     """
     if not others:
         return list(evidence)
-    own, squares = _pixels(evidence, values, times), [torch.zeros(part.seen.shape).double() for part in evidence]
+    own, squares = pixels_of(evidence, [values], times)[0], [torch.zeros(part.seen.shape).double() for part in evidence]
     for other in others:
-        moved = _pixels([replace(part, simulation=other) for part in evidence], values, times)
+        (moved,) = pixels_of([replace(part, simulation=other) for part in evidence], [values], times)
         for square, pixel, here in zip(squares, moved, own, strict=True):
             off = torch.nan_to_num(pixel - here)  # NaN: it diverged
             square[: len(off)] += off.square().sum(-1) / (2 * len(others))
     return [replace(part, trust=(1 + q / NOISE**2).rsqrt()) for part, q in zip(evidence, squares, strict=True)]
 
 
-def _pixels(parts: Sequence[Tracks], values: Values, times: Sequence[float]) -> list[Tensor]:
-    """Where the first frames of each camera, up to the last time, would have its Gaussians [pixels], (F, T, 2)."""
+def pixels_of(parts: Sequence[Tracks], values: Sequence[Values], times: Sequence[float]) -> list[list[Tensor]]:
+    """Where each of some variants would have the Gaussians of each camera in its first frames [pixels], (F, T, 2)."""
     found: list[list[Tensor]] = [[] for _ in parts]
-    for time, states in zip(times, states_of(parts[0].simulation, [values], times, alike=False), strict=True):
+    for time, states in zip(times, states_of(parts[0].simulation, values, times, alike=False), strict=True):
         for part, own in zip(parts, found, strict=True):
             if part.video.frame_at(time) is not None:
-                own.append(part.pixels(part.shown(states), len(own))[0])
-    return list(map(torch.stack, found))
+                own.append(part.pixels(part.shown(states), len(own)))
+    return [[torch.stack(own)[:, k] for own in found] for k in range(len(values))]
+
+
+def turning(parts: Sequence[Tracks], unknowns: Sequence[Unknown], place: Tensor, times: Sequence[float]) -> list[str]:
+    """A sentence on each unknown that moves things mostly to and fro from frame to frame, as of a motion too fast."""
+    moved, found = pixels_of(parts, [values_at(unknowns, end) for end in beside(place)[0]], times), []
+    for u, low, high in zip(unknowns, moved[len(unknowns) :], moved, strict=False):
+        ways = [torch.where(p.seen[: len(a), :, None], b - a, 0.0) for p, a, b in zip(parts, low, high, strict=True)]
+        if sum(float((way[1:] * way[:-1]).sum() - FAST * way.square().sum()) for way in ways) < 0:
+            found.append(f"{u.name} acts on motion too fast for the film, as others may: film more frames a second.")
+    return found

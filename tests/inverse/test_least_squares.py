@@ -12,7 +12,7 @@ from gaussian_swaying.inverse.least_squares import (
     REACH,
     Block,
     DivergedError,
-    _beside,
+    beside,
     cost_of,
     covariance,
     normal,
@@ -102,7 +102,7 @@ def test_sensitivities_are_exact_to_second_order_and_stay_in_the_range():
     matrix, scores = normal(squares, double([0.5, 0.25]), scaled(1.0))
     assert matrix.diagonal().tolist() == pytest.approx([1.0, 1.5**2])
     assert scores[0].sum(0).tolist() == pytest.approx([0.25 * 1.0, 0.1875 * 1.5])
-    assert _beside(double([0.0, 1.0]))[1].min() > 0
+    assert beside(double([0.0, 1.0]))[1].min() > 0
     normal(squares, double([0.0, 1.0]), scaled(1.0))
 
 

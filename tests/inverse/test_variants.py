@@ -1,12 +1,17 @@
 """Variants of a simulation as a batch, against each on its own."""
 
+import math
+from types import SimpleNamespace
+
 import pytest
 import torch
 from shared import in_both, longest, seeded, solid, unit, value_error
 from small_films import base, changed
 
 from gaussian_swaying.gaussians.parts import Part, Parts
-from gaussian_swaying.inverse.variants import states_of
+from gaussian_swaying.inverse import variants
+from gaussian_swaying.inverse.plan import Unknown
+from gaussian_swaying.inverse.variants import states_of, turning
 from gaussian_swaying.mpm.solver import MPMSolver
 from gaussian_swaying.scenes.procedural import FlagScene
 from gaussian_swaying.simulation import step
@@ -16,6 +21,23 @@ from gaussian_swaying.wind.force import AeroForce, WindForce
 from gaussian_swaying.wind.patches import Patches
 
 TIMES = [0.0, 1 / 24, 2 / 24, 4 / 24]
+
+
+@pytest.mark.parametrize(("hertz", "told"), [(5.0, False), (10.0, True)])
+def test_what_moves_too_fast_for_the_film_is_told(hertz, told, monkeypatch):
+    """Another frequency goes beside it by t cos(2 pi f t), which turns from frame to frame at 10 Hz in 24 frames."""
+    times = [k / 24 for k in range(25)]
+
+    def moved(_, values, times):
+        both = [(hertz * math.sqrt(own["material.E"] / 1e4), own["wind.speed"]) for own in values]
+        ways = [[math.sin(2 * math.pi * rate * t) + 2 * speed * t for t in times] for rate, speed in both]
+        return [[torch.tensor(way)[:, None, None].expand(-1, 1, 2)] for way in ways]
+
+    monkeypatch.setattr(variants, "pixels_of", moved)
+    sought = [Unknown("material.E", 1e3, 1e5, "log"), Unknown("wind.speed", 1.0, 9.0, "linear")]
+    track = SimpleNamespace(seen=torch.ones(25, 1, dtype=torch.bool))
+    found = turning([track], sought, torch.tensor([0.5, 0.5], dtype=torch.float64), times)
+    assert [sentence.split()[0] for sentence in found] == ["material.E"] * told
 
 
 def test_each_variant_moves_as_its_own_simulation(simulation, tmp_path):
