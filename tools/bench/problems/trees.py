@@ -8,11 +8,13 @@ frame of Euler and Bernoulli's beams (:func:`frame_modes`) with the same masses.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.integrate import solve_ivp
+from scipy.interpolate import make_interp_spline
 
 from bench.problems.beams import first_zero
 from bench.problems.rods import section
@@ -20,7 +22,7 @@ from bench.problems.settings import Result, Settings, fit_sinusoid, follow
 from gaussian_swaying.geometry.regions import Box
 from gaussian_swaying.mpm.pins import PinnedRegion
 from gaussian_swaying.mpm.state import MaterialPoints, MPMState
-from gaussian_swaying.wind.field import WindField
+from gaussian_swaying.wind.field import FlowKey, WindField
 from gaussian_swaying.wind.force import AeroForce, WindForce
 
 WOOD_E, WOOD_DENSITY = 8e9, 900.0  # Pa, kg/m³; green wood
@@ -205,8 +207,8 @@ class Swaying:
     share: float
 
 
-def swaying(pieces: Sequence[Piece], dx: float, settings: Settings, breeze: float = 0.0) -> Swaying:
-    """The points of a tree, and the mode of its frame at their places, in a breeze along x [m/s]."""
+def swaying(pieces: Sequence[Piece], dx: float, settings: Settings, wind: WindField | None = None) -> Swaying:
+    """The points of a tree, and the mode of its frame at their places, in a wind."""
     from scipy.spatial import cKDTree
 
     omegas, modes, nodes = frame_modes(pieces)
@@ -221,8 +223,9 @@ def swaying(pieces: Sequence[Piece], dx: float, settings: Settings, breeze: floa
     shape[points.position[:, 2] <= 0] = 0
     moving = points.mass * shape.square().sum(-1)
     wood = points.youngs_modulus == WOOD_E
-    wind = WindField([breeze, 0.0, 0.0])
-    force = WindForce(AeroForce(C_D=C_D, C_F=0.0, C_L=0.0, air_density=AIR, law="projected"), wind, normal, area)
+    force = WindForce(
+        AeroForce(C_D=C_D, C_F=0.0, C_L=0.0, air_density=AIR, law="projected"), wind or WindField(), normal, area
+    )
     share = float(moving[wood].sum() / moving.sum())
     return Swaying(points, force.to(points.position.device), float(omegas[0]), shape, share)
 
@@ -269,7 +272,7 @@ def damping(
     The wood damps itself with the same force in both trees: as a rate over all masses, :math:`2 \zeta \omega`
     without leaves, and that times the share of the wood in the mass of the mode with them. The drag of a leaf grows
     with the square of the speed of the air against it, so the damping depends on the pull and on the breeze. The
-    reference is the equation of the mode alone (:func:`mode_damping`), fitted in the same way.
+    reference is the equation of the mode alone (:func:`mode_motion`), fitted in the same way.
 
     Units: ``leaf_area`` [m²]; ``pull``, ``dx`` [m]; ``breeze`` [m/s].
 
@@ -277,8 +280,8 @@ def damping(
         ``ratio`` (damping ratio), ``exact`` (that of the equation of the mode), ``error`` (relative to it), ``hertz``
         and the common quantities.
     """
-    settings = Settings() if settings is None else settings
-    one = swaying(tree(leaf_area, **shape), dx, settings, breeze)  # type: ignore[arg-type]
+    settings, air = settings or Settings(), np.array([breeze, 0.0, 0.0])
+    one = swaying(tree(leaf_area, **shape), dx, settings, WindField(air.tolist()))  # type: ignore[arg-type]
     bare = one if leaf_area == 0 else swaying(tree(0.0, **shape), dx, settings)  # type: ignore[arg-type]
     rate = 2 * wood * bare.omega * one.share
     solver = settings.solver(dx, boundaries=[PinnedRegion(FOOT, "clamp")], damping=rate)
@@ -292,7 +295,8 @@ def damping(
     frames, frame = round(32 * periods), 2 * math.pi / one.omega / 32
     run = follow(solver, start, frame, frames, speed, one.force if leaf_area else None)
     omega, ratio = _fitted(run.time, run.series.reshape(-1))
-    _, exact = _fitted(run.time, mode_damping(one, rate, pull, breeze, frame, frames))
+    speeds = mode_motion(one, rate, pull * one.omega, lambda time: air, frame, frames)[:, 1]
+    _, exact = _fitted(run.time, torch.from_numpy(speeds))
     return run.result(ratio / exact - 1, ratio=ratio, exact=exact, hertz=omega / 2 / math.pi)
 
 
@@ -301,39 +305,85 @@ def _fitted(time: torch.Tensor, speed: torch.Tensor) -> tuple[float, float]:
     return omega, decay / math.hypot(omega, decay)
 
 
-def mode_damping(
-    one: Swaying, rate: float, pull: float, breeze: float, frame: float, frames: int, steps: int = 32
-) -> torch.Tensor:
-    r"""Speed of the top of a tree that moves in its first mode alone, by Runge and Kutta's method.
+def in_gusts(
+    flows: np.ndarray, rate: float, leaf_area: float, wood: float = 0.051, dx: float = 1.0, **shape: float
+) -> dict[str, np.ndarray]:
+    r"""Let a measured wind, the same everywhere, sway a tree from rest.
 
-    .. math:: \ddot q + r \dot q + \omega^2 q = \frac{1}{M} \sum_i \tfrac12 \rho C_D A_i |\mathbf{v}_i|
-        (\mathbf{v}_i \mathbf{n}_i) (\mathbf{n}_i \phi_i), \qquad \mathbf{v}_i = \mathbf{u} - \dot q \phi_i
+    The transfer function of the mode, for small fluctuations about the mean wind, with the push p(u, v) of the air:
 
-    Units: ``pull`` [m]; ``breeze`` [m/s]; ``frame`` [s].
+    .. math:: H = \frac{\partial p / \partial u}{\omega_1^2 - \omega^2 + i \omega (r - \partial p / \partial v)}
+
+    Units: ``flows`` [m/s], shape (T, 3), the mean along x, at a ``rate`` [Hz]; ``leaf_area`` [m²]; ``dx`` [m].
 
     Returns:
-        Speeds [m/s], shape (frames + 1,).
+        Displacement of the first mode at the top [m] at the times of the wind, shape (T,): ``found`` by the solver,
+        ``mode`` by the equation of the mode, ``linear`` by its transfer function, and ``own`` as ``mode`` with the
+        frequency that the tree has on this grid.
+    """
+    settings, frame, frames = Settings(dtype=torch.float32), 1 / rate, len(flows) - 1
+    keys = [FlowKey(frame * k, flow.tolist()) for k, flow in enumerate(flows)]
+    wind = WindField(schedule=keys, interpolation="linear")
+    one = swaying(tree(leaf_area, **shape), dx, settings, wind)  # type: ignore[arg-type]
+    damping = 2 * wood * one.omega * one.share
+    solver = settings.solver(dx, boundaries=[PinnedRegion(FOOT, "clamp")], damping=damping)
+    weight = one.points.mass[:, None] * one.shape
+    total, rest = (weight * one.shape).sum(), one.points.position
+
+    def moved(state: MPMState) -> torch.Tensor:
+        return (weight * (state.position - rest)).sum() / total
+
+    run = follow(solver, solver.init_state(one.points), frame, frames, moved, one.force)
+    air = make_interp_spline(frame * np.arange(len(flows)), flows, 1)
+    push, mean, small = push_of(one), flows.mean(0), 1e-3
+    more = np.array([small, 0.0, 0.0])
+    du = (push(mean + more, 0.0) - push(mean - more, 0.0)) / (2 * small)
+    dv = (push(mean, small) - push(mean, -small)) / (2 * small)
+    circular = 2 * math.pi * np.fft.rfftfreq(2 * len(flows), frame)
+    transfer = du / (one.omega**2 - circular**2 + 1j * circular * (damping - dv))
+    driven = np.fft.irfft(transfer * np.fft.rfft(flows[:, 0] - mean[0], 2 * len(flows)))[: len(flows)]
+    own = replace(one, omega=2 * math.pi * frequency(leaf_area, dx, settings, **shape)["hertz"])
+    return {
+        "found": run.series.reshape(-1).numpy(),
+        "mode": mode_motion(one, damping, 0.0, air, frame, frames)[:, 0],
+        "linear": driven + push(mean, 0.0) / one.omega**2,
+        "own": mode_motion(own, damping, 0.0, air, frame, frames)[:, 0],
+    }
+
+
+def push_of(one: Swaying) -> Callable[[np.ndarray, float], float]:
+    r"""The acceleration of the first mode by an air at a speed of its top [m/s²], from both speeds [m/s].
+
+    .. math:: p(\mathbf{u}, v) = \frac{1}{M} \sum_i \tfrac12 \rho C_D A_i |\mathbf{v}_i| (\mathbf{v}_i \mathbf{n}_i)
+        (\mathbf{n}_i \phi_i), \qquad \mathbf{v}_i = \mathbf{u} - v \phi_i
     """
     leaf = one.force.area > 0
-    shape, normal = one.shape[leaf].double(), one.force.normal[leaf].double()
-    along = (normal * shape).sum(-1)
+    shape, normal, area = (each[leaf].double().numpy() for each in (one.shape, one.force.normal, one.force.area))
     mass = float((one.points.mass[:, None] * one.shape.square()).sum())
-    weight = 0.5 * AIR * C_D * one.force.area[leaf].double() * along / mass
-    air = shape.new_tensor([breeze, 0.0, 0.0])
+    weight = 0.5 * AIR * C_D * area * (normal * shape).sum(-1) / mass
 
-    def change(q: float, v: float) -> tuple[float, float]:
-        against = air - v * shape
-        push = float((weight * against.norm(dim=-1) * (against * normal).sum(-1)).sum())
-        return v, push - rate * v - one.omega**2 * q
+    def push(air: np.ndarray, speed: float) -> float:
+        against = air - speed * shape
+        return float(weight @ (np.linalg.norm(against, axis=1) * (against * normal).sum(-1)))
 
-    q, v, h = 0.0, pull * one.omega, frame / steps
-    found = [v]
-    for _ in range(frames):
-        for _ in range(steps):
-            a = change(q, v)
-            b = change(q + 0.5 * h * a[0], v + 0.5 * h * a[1])
-            c = change(q + 0.5 * h * b[0], v + 0.5 * h * b[1])
-            d = change(q + h * c[0], v + h * c[1])
-            q, v = (x + h / 6 * (a[k] + 2 * b[k] + 2 * c[k] + d[k]) for k, x in enumerate((q, v)))
-        found.append(v)
-    return torch.tensor(found, dtype=torch.float64)
+    return push
+
+
+def mode_motion(
+    one: Swaying, rate: float, start: float, air: Callable[[float], np.ndarray], frame: float, frames: int
+) -> np.ndarray:
+    r"""The top of a tree that moves in its first mode alone, from rest at a speed.
+
+    .. math:: \ddot q + r \dot q + \omega^2 q = p(\mathbf{u}, \dot q)
+
+    Units: ``start``, and ``air`` at a time [m/s]; ``frame`` [s].
+
+    Returns:
+        Displacements [m] and speeds [m/s], shape (frames + 1, 2).
+    """
+    push, times = push_of(one), frame * np.arange(frames + 1)
+
+    def change(time: float, now: np.ndarray) -> list[float]:
+        return [now[1], push(air(time), now[1]) - rate * now[1] - one.omega**2 * now[0]]
+
+    return solve_ivp(change, times[[0, -1]], [0.0, start], t_eval=times, rtol=1e-7, atol=1e-9, max_step=frame).y.T

@@ -1,4 +1,4 @@
-"""Spectra of the generated turbulence beside those of a sonic anemometer above a canopy (20 Hz, 15 minutes).
+"""Records of a sonic anemometer above a canopy (20 Hz, 15 minutes), beside the generated turbulence and on a tree.
 
 Copy the TOA5 files of ``usda-ars-ussl/fluxpart`` (CC0) into ``outputs/gusts``.
 """
@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.signal import welch
 
+from bench.problems.trees import in_gusts
 from bench.runner import ROOT, Row, study
 from gaussian_swaying.wind.turbulence import sheared_variances, turbulence_box
 from gaussian_swaying.wind.wind_files import read_anemometer
@@ -81,3 +82,33 @@ def gusts(record: str, spectrum: str, gamma: float) -> Row:
             }
             best |= {"ratio": ratio.round(2).tolist()}
     return {"speed_m_s": speed, "deviation_m_s": flows.std(0).tolist(), "length_m": length} | best
+
+
+def records(device: str) -> list[Row]:
+    """Every record."""
+    del device
+    return [
+        {"record": path.name, "seconds": 300.0, "leaf_area": 30.0, "dx": 0.5} for path in sorted(RECORDS.glob("*.dat"))
+    ]
+
+
+@study("tree_gusts", records)
+def tree_gusts(record: str, seconds: float, leaf_area: float, dx: float) -> Row:
+    """How a tree of 17 m sways in a record: mean, deviation and spectrum by the solver over those of its first mode."""
+    rate, flows, speed = along_the_wind(record)
+    count = round(seconds * rate)
+    moved = in_gusts(flows[:count] + speed * np.eye(3)[0], rate, leaf_area, dx=dx)
+    late = {name: values[round(30 * rate) :] for name, values in moved.items()}  # it was at rest
+    spectra = {name: welch(values, rate, nperseg=round(50 * rate)) for name, values in late.items()}
+    edges = 0.04 * 2.0 ** np.arange(6)
+    bands = [(spectra["found"][0] >= low) & (spectra["found"][0] < high) for low, high in pairwise(edges)]
+    numbers: Row = {"mean_m": float(late["found"].mean()), "deviation_m": float(late["found"].std())}
+    for name in ("mode", "linear", "own"):
+        ratio = [spectra["found"][1][band].mean() / spectra[name][1][band].mean() for band in bands]
+        numbers[name] = {
+            "mean": float(late["found"].mean() / late[name].mean()),
+            "deviation": float(late["found"].std() / late[name].std()),
+            "correlation": float(np.corrcoef(late["found"], late[name])[0, 1]),
+            "spectrum": np.round(ratio, 3).tolist(),
+        }
+    return numbers | {"edges_hz": edges.round(3).tolist()}
