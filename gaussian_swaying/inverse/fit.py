@@ -174,7 +174,7 @@ class Problem:
     ) -> Solved:
         """Where the steps from a place end."""
         at = torch.tensor(place, dtype=torch.float64)
-        with self.say.work(f"to {times[-1]:.3g} s", most * len(times) * (TRIES + 2 * len(at))):
+        with self.say.work(f"to {times[-1]:.3g} s", (1 + TRIES * most) * len(times) * (1 + 2 * len(at))):
             return solve(self.residuals(evidence, times), at, TRIES * most, closely)
 
     def search(self) -> list[list[float]]:
