@@ -70,13 +70,13 @@ def test_points_count_by_how_far_another_grid_moves_them(own, left):
 
 
 def test_a_grid_on_which_the_scene_diverges_says_nothing(simulation, left, monkeypatch):
-    pixels = module._pixels
+    pixels = module.pixels_of
     calls = []
 
     def lost(*given):
         calls.append(given)
-        return [torch.nan * own if len(calls) == 2 else own for own in pixels(*given)]
+        return [[torch.nan * own if len(calls) == 2 else own for own in part] for part in pixels(*given)]
 
-    monkeypatch.setattr(module, "_pixels", lost)
+    monkeypatch.setattr(module, "pixels_of", lost)
     (part,) = trusted([left], [simulation, simulation], {}, left.video.times[:3])
     assert (part.trust == 1).all()

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import math
 import re
+from statistics import median
 from types import SimpleNamespace as Run
+from typing import Any
 
 from bench.known import KNOWN, plain
 from bench.report import SECTIONS, grid, reached, source, table
@@ -235,5 +237,29 @@ def _percent(share: float | None) -> float | None:
     return None if share is None else 100 * share
 
 
+GOALS = {"wind.speed": 0.05, "wind.azimuth": 5.0, "material.E": 0.15}
+
+
+def _small_films() -> str:
+    head = "films | fitted | within the goals | good, doubtful, failed | good, but more than twice the goals off | "
+    head += "values within two standard errors | processor, median"
+    kinds: dict[str, list[Any]] = {}
+    for run in read("small_films"):
+        kinds.setdefault(run.kind.replace("_", " "), []).append(run)
+    rows = []
+    for kind, runs in kinds.items():
+        off = [max(abs(run.errors[name]) / goal for name, goal in GOALS.items()) for run in runs]
+        verdicts = [run.verdict for run in runs]
+        wrong = sum(one > 2 and verdict == "good" for one, verdict in zip(off, verdicts, strict=True))
+        near = [abs(deviation) <= 2 for run in runs for deviation in run.deviations.values()]
+        told = ", ".join(str(verdicts.count(name)) for name in ("good", "doubtful", "failed"))
+        rows.append(
+            f"{kind} | {len(runs)} | {sum(one <= 1 for one in off)} | {told} | {wrong} | {sum(near)} of {len(near)} "
+            f"| {median(run.processor_s for run in runs):.0f} s"
+        )
+    return grid(head, rows) + "\n\n" + source(read("small_films"))
+
+
+SECTIONS["small_films"] = _small_films
 SECTIONS["sway"] = _sway
 SECTIONS["speed.contact"] = _contact
