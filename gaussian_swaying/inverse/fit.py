@@ -172,7 +172,6 @@ class Problem:
     def solved(
         self, place: Sequence[float], evidence: Sequence[Tracks], times: Sequence[float], most: int, closely: bool
     ) -> Solved:
-        """Where the steps from a place end."""
         at = torch.tensor(place, dtype=torch.float64)
         with self.say.work(f"to {times[-1]:.3g} s", (1 + TRIES * most) * len(times) * (1 + 2 * len(at))):
             return solve(self.residuals(evidence, times), at, TRIES * most, closely)

@@ -83,7 +83,6 @@ class Film:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height [pixels]."""
         return self.first.shape[1], self.first.shape[0]
 
 

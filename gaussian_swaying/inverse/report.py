@@ -76,6 +76,19 @@ class Fit:
         share = self.covariance.diagonal().clamp(min=0).sqrt().tolist()
         return {u.name: s * u.slope(p) for u, s, p in zip(self.unknowns, share, self.place, strict=True)}
 
+    @property
+    def vague(self) -> list[str]:
+        found = []
+        for u, row in zip(self.unknowns, self.rows(), strict=True):
+            most = VAGUE * (abs(row["value"]) if u.scale == "log" else u.high - u.low)
+            most = min(most, TURNED) if u.unit == "degrees" else most
+            found += [u.name] if row["standard_error"] > most else []
+        return found
+
+    @property
+    def at_an_end(self) -> list[str]:
+        return [u.name for u, p in zip(self.unknowns, self.place, strict=True) if p < 1e-3 or p > 1 - 1e-3]
+
     def doubts(self) -> tuple[list[str], list[str]]:
         """Reasons for which the fit has failed, and for which it is doubtful, as sentences with a remedy."""
         failed: list[str] = []
@@ -98,14 +111,12 @@ class Fit:
                     f"so the values may be wrong. {CHECK}, or fit a shorter part (`until`)."
                 )
         doubtful += [self.unsettled] if self.unsettled else []
-        for u, p, row in zip(self.unknowns, self.place, self.rows(), strict=True):
-            most = VAGUE * (abs(row["value"]) if u.scale == "log" else u.high - u.low)
-            if row["standard_error"] > (min(most, TURNED) if u.unit == "degrees" else most):
-                doubtful.append(
-                    f"{u.name} is not determined by this video: its error is large. Film longer or from one more side, "
-                    "or lower `solver.dx`."
-                )
-            doubtful += [] if 1e-3 <= p <= 1 - 1e-3 else [f"{u.name} is at an end of its range: widen the range."]
+        doubtful += [
+            f"{name} is not determined by this video: its error is large. Film longer or from one more side, or lower "
+            "`solver.dx`."
+            for name in self.vague
+        ]
+        doubtful += [f"{name} is at an end of its range: widen the range." for name in self.at_an_end]
         return failed, doubtful
 
     @property
@@ -115,7 +126,6 @@ class Fit:
         return "failed" if failed else "doubtful" if doubtful else "good"
 
     def rows(self) -> list[dict[str, Any]]:
-        """The table: a row for each unknown."""
         found = zip(self.unknowns, self.values.values(), self.errors.values(), strict=True)
         return [
             {"name": u.name, "value": value, "standard_error": error, "unit": u.unit, "low": u.low, "high": u.high}
@@ -123,7 +133,6 @@ class Fit:
         ]
 
     def text(self) -> str:
-        """All of it in words."""
         lines = [f"{'':<28}{'value':>12}{'error':>12}"]
         for row in self.rows():
             lines.append(f"{row['name']:<28}{row['value']:>12.5g}{row['standard_error']:>12.2g} {row['unit']}".rstrip())

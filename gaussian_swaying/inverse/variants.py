@@ -37,7 +37,6 @@ class _Group:
     diverged: bool = False
 
     def moves(self, begin: float, end: float) -> float:
-        """The time for which they move between two times of the film [s]."""
         return max(end - self.start, 0.0) - max(begin - self.start, 0.0)
 
 
@@ -94,7 +93,6 @@ def states_of(
 
 
 def _advance(groups: Sequence[_Group], begin: float, end: float, alike: bool) -> None:
-    """Advance all groups that move from one time of the film to another [s]."""
     groups = [group for group in groups if group.moves(begin, end) > 0]
     for group in groups:
         group.stepper.model = group.stepper.model.replace(frame_dt=group.moves(begin, end))

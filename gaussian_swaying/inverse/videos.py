@@ -46,7 +46,6 @@ class Footage:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height [pixels]."""
         return self.images.shape[2], self.images.shape[1]
 
     def frame_at(self, time: float) -> int | None:
