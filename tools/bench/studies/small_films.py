@@ -74,7 +74,9 @@ def settings(kind: str, cells: float, truth: dict[str, float], ply: Path) -> dic
             "boundaries": [{"class_path": "PinnedRegion", "init_args": {"kind": None, "region": pin}} for pin in pins],
         },
         "wind": {"flow": [truth["wind.speed"] * math.cos(turn), truth["wind.speed"] * math.sin(turn), 0.0]},
-        "aero": {"C_D": 1.0 if post else 0.1, "C_F": 0.0 if post else 0.3, "C_L": 0.0},
+        "aero": {"C_D": 1.0, "C_F": 0.0, "C_L": 0.0, "law": "projected"}
+        if post
+        else {"C_D": 0.1, "C_F": 0.3, "C_L": 0.0},
     }
 
 
