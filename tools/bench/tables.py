@@ -245,7 +245,8 @@ def _small_films() -> str:
     head += "values within two standard errors | processor, median"
     kinds: dict[str, list[Any]] = {}
     for run in read("small_films"):
-        kinds.setdefault(run.kind.replace("_", " "), []).append(run)
+        if not hasattr(run, "failed"):
+            kinds.setdefault(run.kind.replace("_", " "), []).append(run)
     rows = []
     for kind, runs in kinds.items():
         off = [max(abs(run.errors[name]) / goal for name, goal in GOALS.items()) for run in runs]
@@ -260,6 +261,19 @@ def _small_films() -> str:
     return grid(head, rows) + "\n\n" + source(read("small_films"))
 
 
+def _hand_films() -> str:
+    runs = [run for run in read("fit") if "hand_films" in run.case and not hasattr(run, "failed")]
+    rows = []
+    for run in sorted(runs, key=lambda run: run.case):
+        thing, way = run.case.split("/")[-2:]
+        speed, azimuth, E = (run.errors[name] for name in ("speed", "azimuth", "E"))
+        begins = "at rest" if way == "still" else "in motion"
+        told = f"{thing.replace('_', ' ')} {begins} | {100 * speed:+.1f} % | {azimuth:+.1f}° | {100 * E:+.1f} %"
+        rows.append(f"{told} | {run.verdict}")
+    return grid("film | speed | azimuth | E | verdict", rows) + "\n\n" + source(runs)
+
+
+SECTIONS["hand_films"] = _hand_films
 SECTIONS["small_films"] = _small_films
 SECTIONS["sway"] = _sway
 SECTIONS["speed.contact"] = _contact
