@@ -560,7 +560,7 @@ KNOWN = [
     ),
     Known(
         "drag of a square plate across the flow, 1.2 to 1.3", air.plate, {"drag": (1.08, 1.43)},
-        fine=[{"cells": n} for n in (10, 20)], page="air.md",
+        fine=[{"cells": n} for n in (10, 20, 40)], page="air.md",
     ),
     Known(
         "Strouhal number of a cylinder at Re 100, 0.1645 (Williamson 1989)", air.cylinder,
