@@ -16,9 +16,10 @@ from shared import value_error
 from gaussian_swaying.captures.capture import read_capture
 from gaussian_swaying.captures.capture_camera import CaptureCamera
 
-from .conftest import beside
+from .conftest import ROOT, beside
 
 TOOL = "make_flag_dataset"
+CONFIGS = ROOT / "configs"
 reference = beside("flag_reference")
 flag_pictures = beside("flag_pictures")
 flag_motion = beside("flag_motion")
@@ -233,6 +234,22 @@ def test_any_flag_is_read_from_a_file(tool, tmp_path):
         50,
         sys.modules["flag_reference"].least_quality(flags["own"]),
     )
+
+
+def test_benchmarks_have_the_flags_of_their_references(tool):
+    """The same size, turn and ripple at rest: one of 3 mm would be 12 % of the pressure on flag 2."""
+    from gaussian_swaying.simulation.simulation import Simulation
+
+    patterns = {str(number): flag for number, flag in tool.PATTERNS.items()}
+    patterns |= {path.stem: tool.read_flag(path) for path in (CONFIGS / "flags").glob("*.yaml")}
+    assert len(patterns) == 8
+    for name, flag in patterns.items():
+        files = [f"sim/flag{name if name in '123' else 3}", f"bench/flag{name if name in '123' else 3}"]
+        files += [] if name in "123" else [f"bench/flag{name}" if name.isdigit() else f"bench/{name}"]
+        words = [word for file in files for word in ("--config", str(CONFIGS / f"{file}.yaml"))]
+        made = Simulation.parser().parse_args(words).scene.generator.init_args
+        for field in ("width", "height", "yaw", "ripple"):
+            assert made[field] == getattr(flag, field), (name, field)
 
 
 @pytest.mark.parametrize(

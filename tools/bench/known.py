@@ -31,6 +31,7 @@ from bench.problems import (
     fabrics,
     falling,
     flags,
+    flutter,
     joints,
     plates,
     reconfiguration,
@@ -561,6 +562,12 @@ KNOWN = [
     Known(
         "drag of a square plate across the flow, 1.2 to 1.3", air.plate, {"drag": (1.08, 1.43)},
         fine=[{"cells": n} for n in (10, 20, 40)], page="air.md",
+    ),
+    Known("lift of a plate that heaves in an ideal flow", flutter.heaving, {"error": within(0.015)}, [{"kappa": 3.0}]),
+    Known(
+        "wind at which a clamped flag flutters, per that of linear theory", flutter.onset, {"speed": near(1, 0.15)},
+        [{"mass_ratio": 1.0, "cells": 12}],
+        [{"mass_ratio": m, "cells": n} for m in (0.5, 1.0) for n in (24, 48)], {"speed": (0.7, 1.15)}, "air.md",
     ),
     Known(
         "Strouhal number of a cylinder at Re 100, 0.1645 (Williamson 1989)", air.cylinder,

@@ -117,7 +117,7 @@ table(
 
 FLAGS = ("1", "2", "3", "4", "5", "curtain", "light")
 WAYS = {"ours": "ours", "particle": "PhysGaussian's way"}
-SPLATS = {"trained": "trained on photos", "made": "made in code"}
+SPLATS = {"trained": "trained on photos", "two_views": "trained, comparing two views", "made": "made in code"}
 
 
 def _flags() -> str:

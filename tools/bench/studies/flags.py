@@ -1,7 +1,12 @@
-"""Flags beside the motions of Blender's cloth: ways to simulate them, and finer grids.
+r"""Flags beside the motions of Blender's cloth: ways to simulate them, and finer grids.
 
-``python tools/datasets/make_flag_dataset.py`` makes the motions in ``outputs/flags``, with splats of photos trained by
-``tools/train.py --config configs/train/flag.yaml`` in ``outputs/flags/pattern1/splat`` and so on.
+``python tools/datasets/make_flag_dataset.py`` makes the motions and photos in ``outputs/flags``. Splats are trained by
+
+    python tools/train.py fit --config configs/train/default.yaml --config configs/bench/train.yaml \\
+        --data.init_args.path outputs/flags/pattern1/train --trainer.default_root_dir outputs/flags/pattern1/trained
+
+and so on; those that compare ``two_views`` also with ``--config configs/train/surface.yaml --config
+configs/bench/two_views.yaml``, and three of flag 2 with ``--seed_everything`` 0, 1 (``two_views_1``) and 2.
 """
 
 from __future__ import annotations
@@ -41,8 +46,10 @@ def arguments(flag: str, splats: str, way: str) -> list[str]:
     base, own = (flag, []) if flag in "123" else ("3", [f"bench/flag{flag}" if flag.isdigit() else f"bench/{flag}"])
     names = [f"sim/flag{base}", f"bench/flag{base}", *own, *(f"bench/variants/{name}" for name in files)]
     words = [word for name in names for word in ("--config", f"configs/{name}.yaml")] + options
-    if splats == "trained":
-        words += [f"--scene.ply={folder(flag) / 'splat' / 'point_cloud.ply'}"]
+    if splats != "made":
+        words += [f"--scene.ply={folder(flag) / splats / 'point_cloud.ply'}"]
+    if splats.startswith("two_views"):
+        words += ["--scene.normals=neighbours"]
     if {"particle", "no_surface", "no_normals"} & set(files):  # friction equals drag
         words += [f"--aero.C_F={0.8 if flag == '2' else 1.28}"]
     return words
@@ -74,7 +81,10 @@ def compared(words: list[str], flag: str, device: str, frames: int | None = None
     return row | {"chamfer_share": found["chamfer_share"], "psnr_db": found["mean"].get("psnr_db")}
 
 
-@study("flags", [{"splats": s, "variant": w, "flag": f} for s in ("made", "trained") for w in WAYS for f in FLAGS])
+SPLATS = ("made", "trained", "two_views", "two_views_1", "two_views_2")
+
+
+@study("flags", [{"splats": s, "variant": w, "flag": f} for s in SPLATS for w in WAYS for f in FLAGS])
 def flags(splats: str, variant: str, flag: str, device: str) -> Row:
     """One flag in one way."""
     words = arguments(flag, splats, variant)
