@@ -48,18 +48,20 @@ def neighbour_normals(points: Tensor, normals: Tensor, weights: Tensor | None = 
     place, own = points.detach().cpu().double(), normalize(normals.detach().cpu().double(), dim=-1)
     share = torch.ones(count, dtype=torch.float64) if weights is None else weights.detach().cpu().double()
     order = torch.randperm(count, generator=torch.Generator().manual_seed(0))
-    found, fits, limit = own, torch.ones(count, dtype=torch.bool), torch.full((count,), torch.inf, dtype=torch.float64)
+    found, rows = own.clone(), torch.arange(count)
+    limit = torch.full((count,), torch.inf, dtype=torch.float64)
     for size in range(_SIZES):
         some = order[: count // 4**size].sort().values
-        if size and len(some) <= neighbours:
+        if len(rows) == 0 or (size and len(some) <= neighbours):
             break
-        _, index = nearest_neighbours(place[some], min(neighbours, len(some)), place)
-        chunks = torch.arange(count).split(_CHUNK)
-        parts = [_fitted(place, found, share, rows, some[index[rows]]) for rows in chunks]
-        surface, off = (torch.cat(part) for part in zip(*parts, strict=True))
-        fits &= off <= limit
-        limit = limit if size else _AS_GOOD * off
-        found = torch.where(fits[:, None], surface, found)
+        _, index = nearest_neighbours(place[some], min(neighbours, len(some)), place[rows])
+        parts = zip(rows.split(_CHUNK), some[index].split(_CHUNK), strict=True)
+        surface, off = map(torch.cat, zip(*(_fitted(place, found, share, *part) for part in parts), strict=True))
+        fits = off <= limit[rows]
+        if not size:
+            limit = _AS_GOOD * off
+        rows = rows[fits]
+        found[rows] = surface[fits]
     return torch.where((found * own).sum(-1, keepdim=True) < 0, -found, found).to(normals)
 
 
@@ -71,12 +73,13 @@ def _fitted(place: Tensor, normals: Tensor, share: Tensor, rows: Tensor, index: 
     normal = normals[rows]
     weight = share[index] * (normals[index] * normal[:, None]).sum(-1).square()
     off = torch.einsum("nki,ni->nk", offset, normal)
+    kept = 1 + round(0.3 * (index.shape[1] - 1))
     little = torch.tensor([1e-12] * 3 + [1e-8] * 3, dtype=torch.float64).diag()  # few neighbours get a plane
     for _ in range(_ROUNDS):
         first = normalize(torch.linalg.cross(normal, one_hot(normal.abs().argmin(-1), 3).double()), dim=-1)
         along = torch.stack([first, torch.linalg.cross(normal, first)], 1)
         x, y = torch.einsum("nki,nai->ank", offset, along)
-        scale = 4 * off.abs().quantile(0.3, dim=1, keepdim=True) + 1e-9
+        scale = 4 * off.abs().kthvalue(kept, dim=1, keepdim=True).values + 1e-9
         each = weight * (1 - x * x - y * y).clamp_min(0) / (1 + (off / scale).square()).square()
         each = each / each.sum(1, keepdim=True).clamp_min(_TINY)
         terms = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1)
@@ -88,4 +91,4 @@ def _fitted(place: Tensor, normals: Tensor, share: Tensor, rows: Tensor, index: 
         tilted = normalize(normal - torch.einsum("na,nai->ni", fit[:, 1:3], along), dim=-1)
         normal = torch.where(flat, tilted, normal)
         off = height - torch.einsum("nki,ni->nk", terms, fit)
-    return normal, radius * off.abs().quantile(0.3, dim=1)
+    return normal, radius * off.abs().kthvalue(kept, dim=1).values

@@ -130,9 +130,9 @@ class Scene(Fixed):
             connected along the surface (see :func:`~gaussian_swaying.gaussians.connectivity.attached_pairs`), so that
             leaves closer than a cell move apart. ``surface`` needs ``solver.formulation: total``.
         normals: Normals of the patches: ``smallest_axis`` of each Gaussian, as in the paper, or ``neighbours``, of
-            planes through neighbouring centres (see
-            :func:`~gaussian_swaying.geometry.surface_normals.neighbour_normals`), which are better on large smooth
-            surfaces whose Gaussians have good positions but bad orientations.
+            smooth surfaces through neighbouring centres (see
+            :func:`~gaussian_swaying.geometry.surface_normals.neighbour_normals`), which are better where Gaussians
+            have good positions but bad orientations.
     """
 
     live_as = "scene"
