@@ -565,6 +565,10 @@ KNOWN = [
     ),
     Known("lift of a plate that heaves in an ideal flow", flutter.heaving, {"error": within(0.015)}, [{"kappa": 3.0}]),
     Known(
+        "air's damping of a plate that moves up and down, per that of theory (Theodorsen 1935)", flutter.heaving_in_air,
+        {"damping": near(1, 0.1), "mass": near(1, 0.1)}, fine=[{"cells": n} for n in (24, 48)], page="air.md",
+    ),
+    Known(
         "wind at which a clamped flag flutters, per that of linear theory", flutter.onset, {"speed": near(1, 0.15)},
         [{"mass_ratio": 1.0, "cells": 12}],
         [{"mass_ratio": m, "cells": n} for m in (0.5, 1.0) for n in (24, 48)], {"speed": (0.7, 1.15)}, "air.md",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
@@ -37,15 +37,16 @@ def vortices(downwash: np.ndarray, kappa: float) -> np.ndarray:
     return np.linalg.solve(-1 / (2 * math.pi * (BETWEEN[:, None] - VORTEX)) - wake[:, None], downwash)
 
 
-def heaving(kappa: float) -> float:
-    """Relative error of the lift of a plate that moves up and down, beside Theodorsen's (1935, NACA report 496).
-
-    Units: ``kappa`` [U / L].
-    """
+def theodorsen(kappa: float) -> complex:
+    """Force against a plate that moves up and down, per velocity (Theodorsen 1935, NACA report 496)."""
     one, zero = hankel2(1, kappa / 2), hankel2(0, kappa / 2)
-    exact = 0.25j * math.pi * kappa + math.pi * one / (one + 1j * zero)
+    return complex(0.25j * math.pi * kappa + math.pi * one / (one + 1j * zero))
+
+
+def heaving(kappa: float) -> float:
+    """Relative error of the lift of vortices on a plate that moves up and down."""
     lift = (1 + 1j * kappa * (1 - VORTEX)) @ vortices(np.ones(VORTICES), kappa)
-    return float(abs(lift / exact + 1))
+    return abs(lift / theodorsen(kappa) + 1)
 
 
 def wave_number(number: int) -> float:
@@ -85,43 +86,76 @@ def neutral(mass_ratio: float) -> Iterator[tuple[float, float]]:
         before = after
 
 
-def growth(
-    mass_ratio: float, bending: float, cells: int, reynolds: float = 1000.0, until: float = 20.0
-) -> tuple[float, float]:
-    """Rate at which small motion of a flag grows in computed air [U / L], and its angular frequency."""
-    points, box, h = 2 * cells + 1, (7, 6), 1 / cells
-    units, ds = units_of(h, reynolds), 1 / (points - 1)
-    flow = LatticeFlow((box[0] * cells, 1, box[1] * cells), units, faces=("open", "periodic", "open"), smagorinsky=0)
+def in_air(
+    move: Callable[[np.ndarray, np.ndarray, float], tuple[np.ndarray, np.ndarray]], cells: int, until: float
+) -> None:
+    """Let a plate move in computed air of a Reynolds number of 1000.
+
+    ``move`` gets the velocity of the air across the plate at its points and the mass of the layer of air there, per
+    depth, both of shape (N,), and a time step. It returns how far the points are across the flow, and the momenta
+    that they take from the air.
+    """
+    h, units, points = 1 / cells, units_of(1 / cells, 1000.0), 2 * cells + 1
+    flow = LatticeFlow((7 * cells, 1, 6 * cells), units, faces=("open", "periodic", "open"), smagorinsky=0)
     now = flow.start([1.0, 0.0, 0.0]).moments
-    spare, area = torch.empty_like(now), torch.full((points,), ds / h)
-    along = np.linspace(0, 1, points)
-    w, v, mass = 0.05 * along**2, np.zeros(points), np.full(points, mass_ratio * ds)
-    mass[-1] /= 2
-    curve = np.diff(np.eye(points + 1), 2, axis=0)[:, 1:]  # one more point before the clamp stays at 0
-    stiff = -bending / ds**3 * curve.T @ curve
-    substeps = math.ceil(units.dt * 4 / ds**2 * math.sqrt(bending / mass_ratio) / 0.8)
-    step, depth, tips = units.dt / substeps, units.cell_mass / h, []
-    place = torch.zeros(points, 3)
-    place[:, 0] = torch.tensor((along + 2) / h - 0.5)
+    spare, area = torch.empty_like(now), torch.full((points,), cells / (points - 1))
+    place, loss, depth = torch.zeros(points, 3), torch.zeros(points, 3), units.cell_mass / h
+    place[:, 0] = torch.linspace(2, 3, points) / h - 0.5
+    w = np.zeros(points)
     for _ in range(round(until / units.dt)):
-        place[:, 2] = torch.tensor((w + box[1] / 2) / h - 0.5)
+        place[:, 2] = torch.tensor((w + 3) / h - 0.5)
         seen, layer = look(now, area, place, flow.kind)
-        air, share = seen[:, [0, 2]].double().numpy() * units.speed, layer.double().numpy() * depth / substeps
-        taken = np.stack([share * substeps * air[:, 0], np.zeros(points)], 1)  # it moves across the flow only
-        rate = mass * share / (mass + share)
-        for _ in range(substeps):
-            push = rate * (air[:, 1] - v)
-            taken[:, 1] += push
-            v += (step * stiff @ w + push) / mass
-            v[0] = 0
-            w = w + step * v
-        loss = torch.zeros(points, 3)
-        loss[:, [0, 2]] = torch.tensor(taken / (depth * units.speed), dtype=torch.float32)
+        w, taken = move(seen[:, 2].double().numpy() * units.speed, layer.double().numpy() * depth, units.dt)
+        loss[:, 0] = layer * seen[:, 0]  # it does not move along the flow
+        loss[:, 2] = torch.tensor(taken / (depth * units.speed))
         give(now, loss, place, flow.kind)
         flow.advance(now, spare, WIND)
         now, spare = spare, now
-        tips.append(w[-1])
-    return strongest(np.array(tips)[round(5 / units.dt) :: round(0.1 / units.dt)], round(0.1 / units.dt) * units.dt)
+
+
+def growth(mass_ratio: float, bending: float, cells: int, until: float = 20.0) -> tuple[float, float]:
+    """Rate at which small motion of a flag grows in computed air [U / L], and its angular frequency."""
+    points, ds = 2 * cells + 1, 0.5 / cells
+    w, v, mass = 0.05 * np.linspace(0, 1, points) ** 2, np.zeros(points), np.full(points, mass_ratio * ds)
+    mass[-1] /= 2
+    curve = np.diff(np.eye(points + 1), 2, axis=0)[:, 1:]  # one more point before the clamp stays at 0
+    stiff, tips = -bending / ds**3 * curve.T @ curve, []
+
+    def move(air: np.ndarray, layer: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
+        substeps = math.ceil(dt * 4 / ds**2 * math.sqrt(bending / mass_ratio) / 0.8)
+        step, share, taken = dt / substeps, layer / substeps, np.zeros(points)
+        for _ in range(substeps):
+            push = mass * share / (mass + share) * (air - v)
+            taken += push
+            v[:] += (step * stiff @ w + push) / mass
+            v[0] = 0
+            w[:] += step * v
+        tips.append((w[-1], dt))
+        return w, taken
+
+    in_air(move, cells, until)
+    values, dt = np.array(tips).T
+    each = round(0.1 / dt[0])
+    return strongest(values[round(5 / dt[0]) :: each], each * dt[0])
+
+
+def heaving_in_air(cells: int, kappa: float = 2.8) -> dict[str, float]:
+    """Damping and added mass of a plate that moves up and down in computed air, per Theodorsen's."""
+    found, time = [], 0.0
+
+    def move(air: np.ndarray, layer: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
+        nonlocal time
+        taken = layer * (air - 0.02 * kappa * math.cos(kappa * time))
+        found.append((time, taken.sum() / dt))
+        time += dt
+        return np.full(len(air), 0.02 * math.sin(kappa * time)), taken
+
+    in_air(move, cells, 10 * math.pi / kappa)
+    times, lift = np.array(found[2 * len(found) // 5 :]).T
+    waves = np.stack([np.cos(kappa * times), np.sin(kappa * times), np.ones(len(times))], 1)
+    damping, inertia, _ = np.linalg.lstsq(waves, lift, rcond=None)[0] / (0.02 * kappa)
+    exact = theodorsen(kappa)
+    return {"damping": float(-damping / exact.real), "mass": float(inertia / exact.imag)}
 
 
 def strongest(values: np.ndarray, dt: float, count: int = 6) -> tuple[float, float]:
