@@ -602,6 +602,18 @@ KNOWN = [
         {"turns": (0, 0.3)}, fine=[{"froude": 0.3}], page="air.md",
     ),
     Known(
+        "plate at a Froude number of 0.5 flutters, too, from other angles, on other cells, at other Reynolds numbers",
+        _falls, {"turns": (0, 0.3)},
+        fine=[
+            {"froude": 0.5} | other
+            for other in (
+                {}, {"tilt": 0.8}, {"tilt": 0.1}, {"reynolds": 200.0}, {"reynolds": 1500.0}, {"cells": 16},
+                {"cells": 36},
+            )
+        ],
+        page="air.md",
+    ),
+    Known(
         "plate in computed air tumbles from a Froude number of 0.67 on (Belmonte and others 1998)", _falls,
         {"turns": (2.0, ANY)}, fine=[{"froude": f} for f in (0.9, 1.2)], page="air.md",
     ),
