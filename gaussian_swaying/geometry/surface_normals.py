@@ -9,6 +9,7 @@ from torch.nn.functional import normalize, one_hot
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
 _CHUNK = 4096  # points at a time: their neighbours take 40 MB
+_SEARCH = 65_536  # points that are searched for at a time: 0.4 GB
 _SIZES = 4  # of neighbourhoods, each twice as wide as the one before it
 _AS_GOOD = 2.0  # a wider surface may lie so much farther from its points than the first one
 _ROUNDS = 2  # fits to a neighbourhood, each with weights by how far the surface before it was off
@@ -54,9 +55,12 @@ def neighbour_normals(points: Tensor, normals: Tensor, weights: Tensor | None = 
         some = order[: count // 4**size].sort().values
         if len(rows) == 0 or (size and len(some) <= neighbours):
             break
-        _, index = nearest_neighbours(place[some], min(neighbours, len(some)), place[rows])
-        parts = zip(rows.split(_CHUNK), some[index].split(_CHUNK), strict=True)
-        surface, off = map(torch.cat, zip(*(_fitted(place, found, share, *part) for part in parts), strict=True))
+        parts = []
+        for block in rows.split(_SEARCH):
+            index = some[nearest_neighbours(place[some], min(neighbours, len(some)), place[block])[1]]
+            chunks = zip(block.split(_CHUNK), index.split(_CHUNK), strict=True)
+            parts += [_fitted(place, found, share, *chunk) for chunk in chunks]
+        surface, off = map(torch.cat, zip(*parts, strict=True))
         fits = off <= limit[rows]
         if not size:
             limit = _AS_GOOD * off
