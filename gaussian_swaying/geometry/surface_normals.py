@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize, one_hot
+from torch.nn.functional import normalize
 
+from gaussian_swaying.geometry.directions import axes_across
 from gaussian_swaying.geometry.neighbours import nearest_neighbours
 
 _CHUNK = 4096  # points at a time: their neighbours take 40 MB
@@ -80,8 +81,7 @@ def _fitted(place: Tensor, normals: Tensor, share: Tensor, rows: Tensor, index: 
     kept = 1 + round(0.3 * (index.shape[1] - 1))
     little = torch.tensor([1e-12] * 3 + [1e-8] * 3, dtype=torch.float64).diag()  # few neighbours get a plane
     for _ in range(_ROUNDS):
-        first = normalize(torch.linalg.cross(normal, one_hot(normal.abs().argmin(-1), 3).double()), dim=-1)
-        along = torch.stack([first, torch.linalg.cross(normal, first)], 1)
+        along = torch.stack(axes_across(normal), 1)
         x, y = torch.einsum("nki,nai->ank", offset, along)
         scale = 4 * off.abs().kthvalue(kept, dim=1, keepdim=True).values + 1e-9
         each = weight * (1 - x * x - y * y).clamp_min(0) / (1 + (off / scale).square()).square()

@@ -117,6 +117,9 @@ table(
 
 FLAGS = ("1", "2", "3", "4", "5", "curtain", "light")
 WAYS = {"ours": "ours", "particle": "PhysGaussian's way"}
+LOSSES = {"trained": "the paper's"} | {
+    f"two_views{seed and f'_{seed}'}": f"with two views, seed {seed or 0}" for seed in ("", "1", "2")
+}
 SPLATS = {"trained": "trained on photos", "two_views": "trained, comparing two views", "made": "made in code"}
 
 
@@ -134,6 +137,12 @@ def _flags() -> str:
 
 
 SECTIONS["flags"] = _flags
+
+table(
+    "tilts", "tilts", "losses | normals | tilt inside [°] | at the edges [°] | height [mm rms]",
+    lambda run: f"{LOSSES[run.splats]} | `{run.normals}` | {run.inside_deg:.2f} | {run.edges_deg:.2f} "
+    f"| {run.height_mm:.2f}",
+)  # fmt: skip
 
 
 def _wanted(name: str, low: float, high: float) -> str:

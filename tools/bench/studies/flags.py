@@ -2,7 +2,7 @@ r"""Flags beside the motions of Blender's cloth: ways to simulate them, and fine
 
 ``python tools/datasets/make_flag_dataset.py`` makes the motions and photos in ``outputs/flags``. Splats are trained by
 
-    python tools/train.py fit --config configs/train/default.yaml --config configs/bench/train.yaml \\
+    python tools/train.py fit --config configs/train/default.yaml --config configs/bench/train.yaml \
         --data.init_args.path outputs/flags/pattern1/train --trainer.default_root_dir outputs/flags/pattern1/trained
 
 and so on; those that compare ``two_views`` also with ``--config configs/train/surface.yaml --config
@@ -16,6 +16,9 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+
+import numpy as np
+import torch
 
 from bench.runner import ROOT, Row, study
 from gaussian_swaying.evaluation.compare import compare_run
@@ -93,3 +96,26 @@ def flags(splats: str, variant: str, flag: str, device: str) -> Row:
         factor = mass_of(arguments(flag, splats, "ours"))[0] / own
         words += [f"--material.E={factor * E!r}", f"--material.density={factor * density!r}"]
     return compared(words, flag, device)
+
+
+@study("tilts", [{"splats": s, "normals": n} for s in SPLATS[1:] for n in ("smallest_axis", "neighbours")])
+def tilts(splats: str, normals: str) -> Row:
+    """Tilt of the normals of flag 2 at rest, averaged over squares of 4 cm, inside and at the edges (rms)."""
+    parser = Simulation.parser()
+    words = [*arguments("2", splats, "ours"), f"--scene.normals={normals}", "--device=cpu"]
+    scene = Simulation.from_settings(parser, parser.parse_args(words)).scene
+    place, found = scene.model.means[scene.moving].double(), scene.rest_normals[scene.moving].double()
+    with np.load(folder("2") / "cloth.npz") as reference:  # a flat one, 1.2 x 0.8 m
+        true = torch.from_numpy(reference["rest_normals"][0]).double()
+    own = found * (found @ true).sign()[:, None] * scene.model.areas()[scene.moving].double()[:, None]
+    column, row = ((place[:, axis] / 0.04).long().clamp(0, many - 1) for axis, many in ((0, 30), (2, 20)))
+    mean = torch.zeros(600, 3, dtype=torch.float64).index_add(0, 20 * column + row, own).view(30, 20, 3)
+    tilt = torch.rad2deg((torch.nn.functional.normalize(mean, dim=-1) @ true).clamp(max=1).acos()).square()
+    inside = tilt[1:-1, 1:-1]
+    edges = (tilt.sum() - inside.sum()) / (tilt.numel() - inside.numel())
+    height = (place @ true).square().mean().sqrt()
+    return {
+        "inside_deg": float(inside.mean().sqrt()),
+        "edges_deg": float(edges.sqrt()),
+        "height_mm": 1e3 * float(height),
+    }
