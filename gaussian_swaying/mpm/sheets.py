@@ -30,7 +30,6 @@ import torch
 from torch import Tensor
 
 from gaussian_swaying._devices import in_double
-from gaussian_swaying.geometry.directions import axes_across
 from gaussian_swaying.geometry.linalg import entries, matrix
 from gaussian_swaying.geometry.linalg_triton import (
     add3,
@@ -260,7 +259,9 @@ def second_derivatives(fraction: Tensor, normal: Tensor, dx: float) -> Tensor:
 
     pairs = [tuple(int(axis == i) + int(axis == j) for axis in range(3)) for i in range(3) for j in range(3)]
     hessian = torch.stack([product(pair) for pair in pairs]).reshape(3, 3, 27, -1)  # type: ignore[arg-type]
-    first, second = axes_across(normal)
+    axes = torch.eye(3, dtype=normal.dtype, device=normal.device)
+    first = torch.nn.functional.normalize(torch.linalg.cross(normal, axes[normal.abs().argmin(-1)], dim=-1), dim=-1)
+    second = torch.linalg.cross(normal, first, dim=-1)
     return torch.stack(
         [torch.einsum("ijnk,ki,kj->kn", hessian, a, b) for a, b in ((first, first), (second, second), (first, second))],
         dim=1,
